@@ -1,0 +1,17 @@
+"""The error of bad user input: one line naming the file, the field, the value and what is allowed."""
+
+import difflib
+from collections.abc import Iterable
+
+
+class InputError(ValueError):
+    """Bad input from a user. The command line prints it as one line and exits with code 2."""
+
+
+def unknown(what: str, name: str, known: Iterable[str], where: str = "") -> InputError:
+    """An `InputError` for an unknown name, with the nearest match and every allowed one."""
+    known = sorted(known)
+    nearest = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
+    hint = f"did you mean {nearest[0]!r}? " if nearest else ""
+    place = f"{where}: " if where else ""
+    return InputError(f"{place}unknown {what} {name!r}; {hint}choose from {', '.join(known)}")
