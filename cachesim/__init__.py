@@ -1,0 +1,7 @@
+"""The memory-system simulator: traces in, counters of every level out."""
+
+from cachesim import presets as presets
+from cachesim.config import Gpu as Gpu
+from cachesim.report import Report as Report
+from cachesim.simulate import simulate as simulate
+from cachesim.simulate import simulate_all as simulate_all

@@ -1,26 +1,40 @@
-"""GPU configuration: what the counting model needs to know about a machine, checked once and immutable after.
+"""GPU configuration: what the counting model needs of a machine, checked once and immutable after.
 
-Sizes are integers in bytes here; TOML files and overrides may write "48 KiB" (`cachesim.units`). A preset file gives every field
-as `{ value, source, confidence }`; `cachesim.presets` keeps the sources beside the values.
+Sizes are integers in bytes here; TOML files and overrides may write "48 KiB" (`cachesim.units`). A
+preset file gives every field as `{ value, source, confidence }`; `cachesim.presets` keeps the
+sources beside the values.
 """
 
 from __future__ import annotations
 
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
 from cachesim.units import parse_size
 
-Bytes = Annotated[int, BeforeValidator(parse_size), Field(gt=0)]
-Count = Annotated[int, Field(gt=0)]
+#: Bounds keep addresses, and the models' tables, within what a machine can hold.
+MAX_BYTES = 1 << 40
+MAX_COUNT = 1 << 40
+MAX_INSTANCES = 4096
+MAX_LINES = 1 << 27
+
+
+def _whole_number(value: Any) -> Any:
+    """Refuse `true` where a number belongs; pydantic would read it as 1."""
+    if isinstance(value, bool):
+        raise ValueError(f"{value!r} is not a whole number")
+    return value
+
+
+Bytes = Annotated[int, BeforeValidator(parse_size), Field(gt=0, le=MAX_BYTES)]
+Count = Annotated[int, BeforeValidator(_whole_number), Field(gt=0, le=MAX_COUNT)]
+Instances = Annotated[int, BeforeValidator(_whole_number), Field(gt=0, le=MAX_INSTANCES)]
 
 Replacement = Literal["lru", "fifo", "tree-plru", "random", "srrip"]
 SetHash = Literal["linear", "xor", "fermi", "ipoly"]
 PartitionHash = Literal["linear", "xor", "ipoly", "random"]
-WritePolicy = Literal[
-    "read-only", "write-through", "write-back", "write-evict", "local-write-back"
-]
+WritePolicy = Literal["read-only", "write-through", "write-back", "write-evict", "local-write-back"]
 WriteAllocate = Literal["none", "write-allocate", "fetch-on-write", "lazy-fetch-on-read"]
 FetchPath = Literal["texture", "readonly", "global"]
 MAX_SECTORS_PER_LINE = 8
@@ -33,10 +47,12 @@ class _Model(BaseModel):
 class CacheLevel(_Model):
     """One level of cache: the geometry and rules of each of its instances.
 
-    capacity: bytes of one cache unit (of all slices together for a sliced level); changing it scales the number of sets at fixed
-        ways. line_bytes: tag granule. sector_bytes: fill granule. ways: associativity.
-    write_policy, write_allocate: facts sheet section 3.2's `wr` and `wralloc`. "read-only" levels are bypassed by stores;
-        "local-write-back" is write-back for local and write-evict for global accesses (a texel store is global).
+    capacity: bytes of one cache unit (of all slices together for a sliced level); changing it
+        scales the number of sets at fixed ways.
+    line_bytes: tag granule. sector_bytes: fill granule. ways: associativity.
+    write_policy, write_allocate: facts sheet section 3.2's `wr` and `wralloc`. "read-only" levels
+        are bypassed by stores; "local-write-back" is write-back for local and write-evict for
+        global accesses (a texel store is global).
     """
 
     capacity: Bytes
@@ -74,21 +90,23 @@ class CacheLevel(_Model):
             )
         if self.sectors_per_line > MAX_SECTORS_PER_LINE:
             raise ValueError(
-                f"sector_bytes = {self.sector_bytes} makes {self.sectors_per_line} sectors per line; "
-                f"allowed are up to {MAX_SECTORS_PER_LINE}"
+                f"sector_bytes = {self.sector_bytes} makes {self.sectors_per_line} sectors per "
+                f"line; allowed are up to {MAX_SECTORS_PER_LINE}"
             )
         way_bytes = self.num_instances_in_capacity * self.line_bytes * self.ways
         if self.capacity % way_bytes:
             raise ValueError(
-                f"capacity = {self.capacity} B is not a multiple of instances x ways x line_bytes = "
-                f"{way_bytes} B"
+                f"capacity = {self.capacity} B is not a multiple of instances x ways x "
+                f"line_bytes = {way_bytes} B"
             )
         if self.ways > 32767 or self.num_sets * self.ways > (1 << 24):
             raise ValueError(f"ways = {self.ways}, {self.num_sets} sets: too large to simulate")
         if self.replacement == "tree-plru" and self.ways > 64:
             raise ValueError(f"ways = {self.ways} with tree-plru: allowed are up to 64")
-        if self.set_hash in ("ipoly",) and self.num_sets not in (16, 32, 64):
-            raise ValueError(f"set_hash = 'ipoly' with {self.num_sets} sets: allowed are 16, 32, 64")
+        if self.set_hash == "ipoly" and self.num_sets not in (16, 32, 64):
+            raise ValueError(
+                f"set_hash = 'ipoly' with {self.num_sets} sets: allowed are 16, 32, 64"
+            )
         if self.set_hash == "fermi" and self.num_sets not in (32, 64):
             raise ValueError(f"set_hash = 'fermi' with {self.num_sets} sets: allowed are 32, 64")
         if self.set_hash == "xor" and self.num_sets & (self.num_sets - 1):
@@ -103,7 +121,7 @@ class L1(CacheLevel):
     bypass_loads: whether plain global loads skip this level (fetch path "global").
     """
 
-    units_per_sm: Count = 1
+    units_per_sm: Instances = 1
     bypass_loads: bool = False
 
 
@@ -116,13 +134,15 @@ class GL1(CacheLevel):
 class L2(CacheLevel):
     """The L2, in slices behind the partition hash.
 
-    num_channels x slices_per_channel = slices. channel_interleave: bytes of consecutive addresses on one channel; its slices share
-    them in equal runs. partition_hash: facts sheet section 3.3, `gpgpu_memory_partition_indexing`; "random" is any uniform hash
-    of the slice's run (section 3.4).
+    num_channels x slices_per_channel = slices.
+    channel_interleave: bytes of consecutive addresses on one channel; its slices share them in
+        equal runs.
+    partition_hash: facts sheet section 3.3, `gpgpu_memory_partition_indexing`; "random" is any
+        uniform hash of the slice's run (section 3.4).
     """
 
-    num_channels: Count
-    slices_per_channel: Count = 1
+    num_channels: Instances
+    slices_per_channel: Instances = 1
     channel_interleave: Bytes
     partition_hash: PartitionHash
 
@@ -143,12 +163,14 @@ class L2(CacheLevel):
             or run < self.line_bytes
         ):
             raise ValueError(
-                f"channel_interleave = {self.channel_interleave} gives each of {self.slices_per_channel} slices runs of "
-                f"{run} B; allowed are powers of two of at least line_bytes = {self.line_bytes}"
+                f"channel_interleave = {self.channel_interleave} gives each of "
+                f"{self.slices_per_channel} slices runs of {run} B; allowed are powers of two of "
+                f"at least line_bytes = {self.line_bytes}"
             )
         if self.partition_hash == "xor" and self.num_channels & (self.num_channels - 1):
             raise ValueError(
-                f"partition_hash = 'xor' with num_channels = {self.num_channels}: needs a power of two"
+                f"partition_hash = 'xor' with num_channels = {self.num_channels}: "
+                "needs a power of two"
             )
         return self
 
@@ -158,15 +180,17 @@ class LLC(L2):
 
 
 class SM(_Model):
-    """The shader multiprocessors (RDNA: CUs). count: how many. max_warps, max_ctas: residency limits of one.
+    """The shader multiprocessors (RDNA: CUs).
 
+    count: how many. max_warps, max_ctas: residency limits of one.
     warp_size: lanes of one issued access; 64 takes two 32-lane rows of a group together.
-    registers, shared: 32-bit registers and bytes of shared memory of one SM, which a launch may ask for.
+    registers, shared: 32-bit registers and bytes of shared memory of one SM, which a launch may
+        ask for.
     """
 
-    count: Count
-    max_warps: Count
-    max_ctas: Count
+    count: Instances
+    max_warps: Instances
+    max_ctas: Instances
     warp_size: Literal[32, 64] = 32
     registers: Count
     shared: Bytes
@@ -179,8 +203,9 @@ class Dram(_Model):
 
 
 class Gpu(_Model):
-    """One machine. `l1_texture`: a separate texture L1 (the `-gpgpusim` presets), used by fetch path "texture" where present.
+    """One machine.
 
+    l1_texture: a separate texture L1 (the `-gpgpusim` presets), used by fetch path "texture".
     texture_layout: the texel layout of sampled textures, a name in `traces.layout.LAYOUTS`.
     lane_address_path: the fetch path of a lane-address trace unless told otherwise.
     """
@@ -205,7 +230,29 @@ class Gpu(_Model):
         last = self.llc or self.l2
         if last.sector_bytes % self.dram.sector_bytes:
             raise ValueError(
-                f"dram.sector_bytes = {self.dram.sector_bytes} does not divide the last cache's sector_bytes = "
-                f"{last.sector_bytes}"
+                f"dram.sector_bytes = {self.dram.sector_bytes} does not divide the last cache's "
+                f"sector_bytes = {last.sector_bytes}"
             )
+        for path, level, instances in self._levels():
+            lines = instances * level.num_sets * level.ways
+            if lines > MAX_LINES:
+                raise ValueError(
+                    f"{path}.capacity = {level.capacity} makes {lines} lines in {instances} "
+                    f"instances; allowed are up to {MAX_LINES}"
+                )
         return self
+
+    def _levels(self) -> list[tuple[str, CacheLevel, int]]:
+        """Path, level and number of its instances in the whole GPU, of the levels there are."""
+        levels: list[tuple[str, CacheLevel, int]] = [
+            ("l1", self.l1, self.sm.count * self.l1.units_per_sm),
+            ("l2", self.l2, self.l2.num_slices),
+        ]
+        if self.l1_texture is not None:
+            units = self.sm.count * self.l1_texture.units_per_sm
+            levels.append(("l1_texture", self.l1_texture, units))
+        if self.gl1 is not None:
+            levels.append(("gl1", self.gl1, -(-self.sm.count // self.gl1.sms_per_instance)))
+        if self.llc is not None:
+            levels.append(("llc", self.llc, self.llc.num_slices))
+        return levels

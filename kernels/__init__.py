@@ -1,0 +1,7 @@
+"""The OpenCL side: scenes, G-buffers and the subsurface passes."""
+
+import os
+
+# Before anything below imports pyopencl, which reads this once: its cache of binaries waits for
+# minutes on a lock that a killed run left behind, and PoCL keeps a cache of its own.
+os.environ.setdefault("PYOPENCL_NO_CACHE", "1")

@@ -24,6 +24,8 @@ class GBuffer:
     normal: (h, w, 3) float32, unit world-space normal; 0 where nothing is.
     profile_id: (h, w) uint8; 0 = no subsurface scattering, 1 = skin.
     projection_x: M = 1 / tan(fov_x / 2), so that pixels per mm at depth z cm = 0.05 * w * M / z (facts sheet 2.5).
+    velocity: (h, w, 2) float32, texels: where the surface of a pixel stood in the previous frame, minus where it stands now;
+        None = nothing moves.
     """
 
     name: str
@@ -35,6 +37,7 @@ class GBuffer:
     profile_id: npt.NDArray[np.uint8]
     projection_x: float
     attribution: str = ""
+    velocity: Float | None = None
 
     def __post_init__(self) -> None:
         height, width = self.depth_cm.shape if self.depth_cm.ndim == 2 else (0, 0)
@@ -44,6 +47,8 @@ class GBuffer:
             self._check(field, (height, width, 3), np.float32)
         self._check("depth_cm", (height, width), np.float32)
         self._check("profile_id", (height, width), np.uint8)
+        if self.velocity is not None:
+            self._check("velocity", (height, width, 2), np.float32)
         if (self.depth_cm < 0).any():
             raise InputError(f"{self.name}: depth_cm: negative values; allowed are 0 (nothing) and up")
         if not self.projection_x > 0:

@@ -15,3 +15,7 @@ def unknown(what: str, name: str, known: Iterable[str], where: str = "") -> Inpu
     hint = f"did you mean {nearest[0]!r}? " if nearest else ""
     place = f"{where}: " if where else ""
     return InputError(f"{place}unknown {what} {name!r}; {hint}choose from {', '.join(known)}")
+
+
+class WorkError(RuntimeError):
+    """A failure while working: no space, no device. The command line prints it as one line and exits with code 1."""

@@ -1,0 +1,122 @@
+"""Replacement policies: for each, what an access to a present line does (`touch`) and which line of a full set goes (`victim`).
+
+Lines of a set form a ring in recency order (`newer`, `older`; `newest` names the set's most recent line), so that LRU and FIFO
+cost the same at 16 or 96 ways: the victim is the line next to the newest in ring order. Lines never used come first.
+
+    policy     | an access does            | the victim is
+    LRU        | moves the line to front   | the back of the ring
+    FIFO       | nothing                   | the back of the ring
+    TREE_PLRU  | points the tree away      | where the tree points
+    RANDOM     | nothing                   | a hash of the set's fill count
+    SRRIP      | re-reference value := 0   | the first line at 3, after ageing all until there is one [Jaleel et al. 2010, SRRIP-HP]
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from cachesim.address import mix64
+
+LRU, FIFO, TREE_PLRU, RANDOM, SRRIP = range(5)
+CODES = {"lru": LRU, "fifo": FIFO, "tree-plru": TREE_PLRU, "random": RANDOM, "srrip": SRRIP}
+
+#: SRRIP with 2-bit values: a new line is predicted to come back after a long time, a line at 3 in the distant future.
+SRRIP_NEW, SRRIP_MAX = 2, 3
+
+U64 = np.uint64
+U32 = np.uint32
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _to_front(line, cache_set, newest, newer, older):  # type: ignore[no-untyped-def]
+    """Make `line` the newest of its set's ring. older[newest] walks back in time; newer[newest] is the oldest line."""
+    front = newest[cache_set]
+    if line != front:
+        before, after = newer[line], older[line]
+        older[before] = after
+        newer[after] = before
+        oldest = newer[front]
+        newer[front] = line
+        older[line] = front
+        newer[line] = oldest
+        older[oldest] = line
+        newest[cache_set] = line
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _point_away(way, ways, cache_set, tree):  # type: ignore[no-untyped-def]
+    """Set the tree bits on the path to `way` so that they point to the other side."""
+    bits = tree[cache_set]
+    node, low, high = U64(1), U64(0), U64(1)
+    while high < ways:
+        high <<= U64(1)
+    while high - low > U64(1):
+        middle = (low + high) >> U64(1)
+        if way < middle:
+            bits |= U64(1) << (node - U64(1))
+            node, high = node << U64(1), middle
+        else:
+            bits &= ~(U64(1) << (node - U64(1)))
+            node, low = (node << U64(1)) | U64(1), middle
+    tree[cache_set] = bits
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _pointed_way(ways, cache_set, tree):  # type: ignore[no-untyped-def]
+    """The way the tree points to; a side without ways (ways not a power of two) is never taken."""
+    bits = tree[cache_set]
+    node, low, high = U64(1), U64(0), U64(1)
+    while high < ways:
+        high <<= U64(1)
+    while high - low > U64(1):
+        middle = (low + high) >> U64(1)
+        if (bits >> (node - U64(1))) & U64(1) and middle < ways:
+            node, low = (node << U64(1)) | U64(1), middle
+        else:
+            node, high = node << U64(1), middle
+    return low
+
+
+@njit(cache=True, nogil=True, inline="always")
+def touch(policy, line, cache_set, ways, newest, newer, older, tree, rrpv):  # type: ignore[no-untyped-def]
+    """A present line was accessed."""
+    if policy == LRU:
+        _to_front(line, cache_set, newest, newer, older)
+    elif policy == TREE_PLRU:
+        _point_away(U64(line) - U64(cache_set) * ways, ways, cache_set, tree)
+    elif policy == SRRIP:
+        rrpv[line] = 0
+
+
+@njit(cache=True, nogil=True, inline="always")
+def victim(policy, cache_set, ways, newest, newer, tree, rrpv, fills):  # type: ignore[no-untyped-def]
+    """The line of the set that a new tag replaces, marked as just inserted. Unused lines go first, in way order."""
+    first = U64(cache_set) * ways
+    if policy == LRU or policy == FIFO:
+        line = newer[newest[cache_set]]
+        newest[cache_set] = line
+        return line
+    count = fills[cache_set]
+    fills[cache_set] = count + U64(1)
+    if count < ways:
+        way = count
+    elif policy == RANDOM:
+        way = ((mix64((U64(cache_set) << U64(32)) ^ count) >> U64(32)) * ways) >> U64(32)
+    elif policy == TREE_PLRU:
+        way = _pointed_way(ways, cache_set, tree)
+    else:
+        way = ways
+        while way == ways:
+            for w in range(ways):
+                if rrpv[first + U64(w)] == SRRIP_MAX:
+                    way = U64(w)
+                    break
+            if way == ways:
+                for w in range(ways):
+                    rrpv[first + U64(w)] += np.uint8(1)
+    if policy == TREE_PLRU:
+        _point_away(way, ways, cache_set, tree)
+    elif policy == SRRIP:
+        rrpv[first + way] = SRRIP_NEW
+    return U32(first + way)

@@ -1,0 +1,197 @@
+"""The dissertation's central comparison: the same frame with a fixed and with an adaptive count.
+
+In go scenes and GPUs; out come, per scene, GPU and method, the demand and miss rate of each cache
+level, in total and per mip of the irradiance texture, and the quality of both pictures. The slides
+give the comparison for one GPU (TITAN X Pascal, side view) as plots without axes, so only
+directions can be held against ours.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import pandas as pd
+
+from cachesim import simulate_all
+from experiments.console import StageClock
+from kernels.frame import Frame, render
+from kernels.method import Method
+from kernels.quality import psnr, reference_image
+from kernels.record import record
+
+if TYPE_CHECKING:
+    from cachesim import Report
+    from cachesim.config import Gpu
+    from kernels.device import Device
+    from kernels.gbuffer import GBuffer
+
+METHODS = ("fixed", "adaptive")
+REFERENCE_SAMPLES = 1024
+#: The texture that the mip levels belong to: irradiance and depth, which the sampling pass reads.
+MIPPED_TEXTURE = "setup"
+#: Slides, 1080p on a Quadro P4000: PSNR of adaptive in dB, sampling time adaptive / fixed.
+PAPER_PSNR_DB = {"close": 37.58, "ear": 45.70, "front": 44.28}
+PAPER_TIME_RATIO = {"close": 0.140, "ear": 0.280, "front": 0.262}
+
+
+@dataclass(frozen=True, eq=False)
+class SceneResult:
+    """One scene, both methods.
+
+    label: the scene's name in tables. frames, psnr_db, reports: by method; reports one per GPU.
+    """
+
+    label: str
+    gbuffer: GBuffer
+    frames: dict[str, Frame]
+    psnr_db: dict[str, float]
+    reports: dict[str, list[Report]]
+
+
+def compare(
+    label: str,
+    gbuffer: GBuffer,
+    gpus: Sequence[Gpu],
+    *,
+    num_frames: int,
+    method: Method | None = None,
+    device: Device | None = None,
+    clock: StageClock | None = None,
+    step: Callable[[str], None] = lambda _: None,
+) -> SceneResult:
+    """Render, measure, record and count one scene with both methods.
+
+    Args:
+        label: the scene's name in tables.
+        gbuffer: the scene.
+        gpus: what to count on, all in one pass over each recording.
+        num_frames: frames of the adaptive run; the last one is shown, measured and traced.
+        method: settings that both methods share.
+        device: where to render.
+        clock: is given the time of each stage.
+        step: is told the next stage's name.
+    """
+    clock = clock or StageClock()
+    shared = method or Method()
+    frames, qualities, reports = {}, {}, {}
+
+    def stage(name: str) -> Any:
+        step(f"{label}: {name}")
+        return clock.stage(name)
+
+    with stage(f"reference, {REFERENCE_SAMPLES} samples per pixel"):
+        reference = reference_image(gbuffer, shared, device, REFERENCE_SAMPLES)
+    for kind in METHODS:
+        chosen = replace(shared, kind=kind)
+        count = num_frames if chosen.adaptive else 1
+        with stage(f"rendering {kind}"):
+            frame = render(gbuffer, chosen, num_frames=count, device=device)
+        frames[kind] = frame
+        qualities[kind] = psnr(frame.combined, reference, gbuffer.subsurface)
+        with stage(f"recording and counting {kind}"):
+            trace = record(gbuffer, chosen, num_frames=count, device=device)
+            reports[kind] = simulate_all(trace, gpus)
+    return SceneResult(label, gbuffer, frames, qualities, reports)
+
+
+def mean_count(result: SceneResult, method: str) -> float:
+    """Samples per scattering pixel."""
+    return result.frames[method].num_samples / int(result.gbuffer.subsurface.sum())
+
+
+def quality_frame(results: Sequence[SceneResult]) -> pd.DataFrame:
+    """One row per scene: what is in the frame, how many samples, and how good both pictures are."""
+    rows = []
+    for result in results:
+        fixed, adaptive = (mean_count(result, m) for m in METHODS)
+        rows.append(
+            {
+                "scene": result.label,
+                "coverage_rate": result.gbuffer.coverage_rate,
+                "pixels_per_mm": result.gbuffer.pixels_per_mm(),
+                "samples_fixed": fixed,
+                "samples_adaptive": adaptive,
+                "samples_ratio": adaptive / fixed,
+                "paper_time_ratio": PAPER_TIME_RATIO.get(result.label),
+                "psnr_fixed_db": result.psnr_db["fixed"],
+                "psnr_adaptive_db": result.psnr_db["adaptive"],
+                "paper_psnr_adaptive_db": PAPER_PSNR_DB.get(result.label),
+            }
+        )
+    return pd.DataFrame(rows)
+
+
+def demand_frame(results: Sequence[SceneResult]) -> pd.DataFrame:
+    """One row per scene, GPU and method: lane fetches, demand in bytes, and miss rates.
+
+    Columns of levels that a GPU lacks are empty.
+    """
+    rows = []
+    for result in results:
+        for method in METHODS:
+            for report in result.reports[method]:
+                demand = report.demand
+                row: dict[str, Any] = {
+                    "scene": result.label,
+                    "gpu": report.gpu,
+                    "method": method,
+                    "lane_fetches": demand.lane_fetches,
+                    "l1_bytes": demand.l1_bytes,
+                    "l2_bytes": demand.l2_bytes,
+                    "dram_bytes": demand.dram_bytes,
+                }
+                for level in report.levels:
+                    row[f"{level}_miss_rate"] = report.counters[level].miss_rate
+                rows.append(row)
+    frame = pd.DataFrame(rows)
+    order = {name: i for i, name in enumerate(dict.fromkeys(frame["gpu"]))}
+    scenes = {name: i for i, name in enumerate(dict.fromkeys(frame["scene"]))}
+    keys = frame["scene"].map(scenes) * len(order) + frame["gpu"].map(order)
+    return frame.iloc[keys.argsort(kind="stable")].reset_index(drop=True)
+
+
+def ratio_frame(demand: pd.DataFrame) -> pd.DataFrame:
+    """Adaptive / fixed of every number of `demand_frame`: one row per scene and GPU."""
+    keys = ["scene", "gpu"]
+    fixed, adaptive = (
+        demand[demand["method"] == m].drop(columns="method").set_index(keys) for m in METHODS
+    )
+    return (adaptive / fixed).reset_index()
+
+
+def mip_frame(results: Sequence[SceneResult]) -> pd.DataFrame:
+    """One row per scene, GPU, method and part of memory; the parts sum to the frame's totals.
+
+    A part is one mip of the irradiance texture, or all other textures together ("other").
+    """
+    rows = []
+    for result in results:
+        for method in METHODS:
+            for report in result.reports[method]:
+                for part in report.by or ():
+                    is_mipped = part["texture"] == MIPPED_TEXTURE
+                    rows.append(
+                        {
+                            "scene": result.label,
+                            "gpu": report.gpu,
+                            "method": method,
+                            "part": f"mip {part['mip']}" if is_mipped else "other",
+                            "lane_fetches": part["lane_fetches"],
+                            "l1_accesses": part["l1"]["accesses"],
+                            "l1_misses": part["l1"]["misses"],
+                            "l1_bytes": part["l1"]["accesses"]
+                            * report.counters["l1"].sector_bytes,
+                            "l2_accesses": part["l2"]["accesses"],
+                            "l2_misses": part["l2"]["misses"],
+                            "l2_bytes": part["l2"]["accesses"]
+                            * report.counters["l2"].sector_bytes,
+                            "dram_bytes": part["dram"]["bytes"],
+                        }
+                    )
+    keys = ["scene", "gpu", "method", "part"]
+    frame = pd.DataFrame(rows).groupby(keys, sort=False).sum().reset_index()
+    for level in ("l1", "l2"):
+        frame[f"{level}_miss_rate"] = frame[f"{level}_misses"] / frame[f"{level}_accesses"]
+    return frame

@@ -1,0 +1,98 @@
+"""The `cachesim` command: one module per command, and one place that turns errors into a line and an exit code.
+
+Exit codes: 0 done, 2 bad input, 1 failed while working, 130 interrupted. Modules of commands import what they use inside the
+function, so that `--help` is quick and commands on saved traces never load OpenCL.
+"""
+
+from __future__ import annotations
+
+import errno
+import sys
+from collections.abc import Sequence
+
+import typer
+
+from experiments import (
+    bench,
+    bound,
+    check,
+    demo,
+    doctor,
+    info,
+    layouts,
+    prefilter,
+    presets,
+    record,
+    render,
+    run,
+    sweep,
+)
+from traces.errors import InputError, WorkError
+
+DONE, FAILED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
+
+app = typer.Typer(
+    name="cachesim",
+    help="Simulate the GPU caches under screen-space subsurface scattering: render, record, count, compare.",
+    no_args_is_help=True,
+    add_completion=False,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+for module in (
+    demo,
+    prefilter,
+    record,
+    run,
+    sweep,
+    bound,
+    presets,
+    layouts,
+    info,
+    check,
+    render,
+    bench,
+    doctor,
+):
+    app.command(module.__name__.rpartition(".")[2])(module.command)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run the command line and leave with its exit code."""
+    sys.exit(run_command(arguments))
+
+
+def run_command(arguments: Sequence[str] | None = None) -> int:
+    """Run a command line and return its exit code; what went wrong is one line on stderr."""
+    try:
+        code = app(args=arguments, prog_name="cachesim", standalone_mode=False)
+    except InputError as error:
+        return _fail(BAD_INPUT, str(error))
+    except typer.TyperException as error:
+        return _fail(BAD_INPUT, error.format_message())
+    except (KeyboardInterrupt, typer.Abort):
+        code = INTERRUPTED
+    except WorkError as error:
+        return _fail(FAILED, str(error))
+    except MemoryError:
+        return _fail(FAILED, "out of memory")
+    except OSError as error:
+        return _fail(FAILED, describe_os_error(error))
+    # Typer hands an interrupt inside a command on as an exit code.
+    return _fail(INTERRUPTED, "interrupted") if code == INTERRUPTED else int(code or DONE)
+
+
+def describe_os_error(error: OSError) -> str:
+    """One line: the file where one is known, and what the system says of it."""
+    what = "no space left on the disk" if error.errno == errno.ENOSPC else error.strerror
+    return f"{error.filename}: {what}" if error.filename else str(what or error)
+
+
+def _fail(code: int, message: str) -> int:
+    print(f"cachesim: error: {' '.join(message.split())}", file=sys.stderr, flush=True)
+    return code
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,87 @@
+"""`cachesim render`: pictures of a scene without scattering, with it, and of where the samples go."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from experiments import method_options as options
+from experiments.options import (
+    AlbedoMap,
+    CameraName,
+    DeviceName,
+    Folder,
+    ImageSize,
+    NormalMap,
+    SceneName,
+)
+
+
+def command(
+    scene: SceneName = "front",
+    camera: CameraName = None,
+    albedo_map: AlbedoMap = None,
+    normal_map: NormalMap = None,
+    size: ImageSize = "1920x1080",
+    output: Folder = Path("out"),
+    frames: Annotated[int, typer.Option("--frames", metavar="N", min=1)] = 16,
+    device: DeviceName = None,
+    method: options.Kind = "adaptive",
+    samples: options.Samples = 64,
+    rule: options.Rule = "paper",
+    kappa: options.Kappa = 0.2,
+    sigma0_sq: options.Sigma0Sq = 0.001,
+    scale: options.Scale = "physical",
+    mip_rule: options.MipRule = "eq-5.12",
+    inverse_cdf: options.InverseCdf = "approximate",
+    weights: options.Weights = "self-normalised",
+) -> None:
+    """Render a scene: a preview without scattering, the scattered picture, and the map of sample counts."""
+    from experiments.console import progress, remark
+    from experiments.options import parse_image_size, scene_arguments
+    from experiments.output import output_folder, write_figure
+
+    width, height = parse_image_size(size)
+    mesh = scene_arguments(scene, camera, albedo_map, normal_map)
+    chosen = options.make_method(
+        {
+            "kind": method,
+            "num_samples": samples,
+            "rule": rule,
+            "kappa": kappa,
+            "sigma0_sq": sigma0_sq,
+            "scale": scale,
+            "mip_rule": mip_rule,
+            "inverse_cdf": inverse_cdf,
+            "weights": weights,
+        }
+    )
+    folder = output_folder(output)
+    from experiments.plots import count_map
+    from kernels.device import open_device
+    from kernels.frame import render as render_frames
+    from kernels.picture import preview, save_png, tone_map
+    from kernels.scene import load_scene
+
+    opened = open_device(device)
+    gbuffer = load_scene(scene, width, height, device=opened, **mesh)
+    with progress(f"rendering {gbuffer.name}", 1) as bar:
+        frame = render_frames(
+            gbuffer, chosen, num_frames=frames, device=opened, progress=bar.update
+        )
+    stem = gbuffer.name.replace(":", "-")
+    save_png(folder / f"{stem}-preview.png", preview(gbuffer))
+    save_png(folder / f"{stem}-{method}.png", tone_map(frame.combined))
+    figure = count_map(frame.counts, f"{gbuffer.name}, frame {frame.index}", gbuffer.attribution)
+    write_figure(folder / f"{stem}-{method}-counts.png", figure)
+    for line in (
+        f"{gbuffer.name} {width}x{height} on {opened.name}: coverage {gbuffer.coverage_rate:.1%}, "
+        f"{gbuffer.pixels_per_mm():.2f} pixels per mm, "
+        f"{frame.num_samples / max(int(gbuffer.subsurface.sum()), 1):.1f} samples per pixel in frame {frame.index}",
+        gbuffer.attribution,
+        f"wrote {stem}-preview.png, {stem}-{method}.png and {stem}-{method}-counts.png to {folder}",
+    ):
+        if line:
+            remark(line)

@@ -1,0 +1,122 @@
+"""The access instructions of each pass, and which row of a trace each execution of one gets.
+
+A warp's rows are its pass's accesses in program order: those before the sample loop, the loop's once per step, those after it.
+A row's place therefore follows from the warp's state and step alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from kernels.grid import OUTSIDE
+from traces.texture import INACTIVE_TEXEL, WARP_SIZE
+from traces.trace import Instruction
+
+States = npt.NDArray[np.int32]
+Offsets = npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Access:
+    """One access instruction of a pass's kernel.
+
+    texture: name. subsurface_only: executed by warps with a scattering lane, for those lanes; else by every lane in the frame.
+    in_loop: executed once per sample; implies subsurface_only. arithmetic, num_outstanding: as in `Instruction`.
+    """
+
+    texture: str
+    operation: str = "load"
+    footprint: str = "point"
+    subsurface_only: bool = False
+    in_loop: bool = False
+    arithmetic: tuple[tuple[str, int], ...] = ()
+    num_outstanding: int = -1
+
+
+@dataclass(frozen=True)
+class Program:
+    """One pass as a list of accesses; the loop's stand together. first_instruction: index of the first in the trace."""
+
+    pass_name: str
+    accesses: tuple[Access, ...]
+    first_instruction: int = 0
+
+    @property
+    def _loop(self) -> list[int]:
+        return [i for i, access in enumerate(self.accesses) if access.in_loop]
+
+    def instructions(self, textures: Sequence[str]) -> list[Instruction]:
+        """The accesses as `Instruction`s. textures: names in the trace's order."""
+        return [
+            Instruction(
+                self.pass_name,
+                textures.index(a.texture),
+                a.operation,
+                a.footprint,
+                arithmetic=a.arithmetic,
+                num_outstanding=a.num_outstanding,
+            )
+            for a in self.accesses
+        ]
+
+    def row_offsets(self, states: States) -> Offsets:
+        """(num_warps + 1,) int64: where each warp's rows begin."""
+        in_loop = len(self._loop)
+        subsurface = sum(a.subsurface_only for a in self.accesses)
+        always = len(self.accesses) - subsurface - in_loop
+        rows = np.where(states > 0, always + subsurface + in_loop * states.astype(np.int64), always)
+        rows[states == OUTSIDE] = 0
+        return np.concatenate([[0], np.cumsum(rows)])
+
+    def _rows_outside_loop(self, states: States, offsets: Offsets) -> list[tuple[int, Offsets, Offsets]]:
+        """(access, warps, rows) of each access outside the loop: which warps execute it, and in which rows."""
+        loop, before, found = self._loop, np.zeros(len(states), np.int64), []
+        for i, access in enumerate(self.accesses):
+            if access.in_loop:
+                if i == loop[-1]:
+                    before += len(loop) * np.maximum(states, 0)
+                continue
+            executes = states > 0 if access.subsurface_only else states != OUTSIDE
+            warps = np.flatnonzero(executes)
+            found.append((i, warps, offsets[:-1][warps] + before[warps]))
+            before += executes
+        return found
+
+    def _loop_start(self) -> int:
+        """Accesses before the loop, in a warp that executes it."""
+        return self._loop[0] if self._loop else 0
+
+    def row_instructions(self, states: States, offsets: Offsets) -> npt.NDArray[np.uint16]:
+        """(num_rows,) uint16: the instruction of each row of these warps; `offsets` from `row_offsets`."""
+        loop = self._loop
+        rows = np.empty(int(offsets[-1]), np.uint16)
+        if loop:
+            # The loop's pattern in every row, counted from each warp's first turn; the others overwrite theirs.
+            phase = ((offsets[:-1] + self._loop_start()) % len(loop)).astype(np.int64)
+            turn = (np.arange(len(rows)) - np.repeat(phase, np.diff(offsets))) % len(loop)
+            rows[:] = turn + (loop[0] + self.first_instruction)
+        for i, _, at in self._rows_outside_loop(states, offsets):
+            rows[at] = i + self.first_instruction
+        return rows
+
+    def place(
+        self, states: States, texels: Sequence[npt.NDArray[np.uint32]]
+    ) -> tuple[Offsets, npt.NDArray[np.uint32]]:
+        """The rows of a whole launch from each access's texels, for the references.
+
+        texels: per access, (num_warps, 32), or (num_steps, num_warps, 32) for the loop's; rows that no warp executes are dropped.
+        """
+        offsets = self.row_offsets(states)
+        lanes = np.full((int(offsets[-1]), WARP_SIZE), INACTIVE_TEXEL, np.uint32)
+        for i, warps, at in self._rows_outside_loop(states, offsets):
+            lanes[at] = texels[i][warps]
+        for k, i in enumerate(self._loop):
+            for step, texel in enumerate(texels[i]):
+                warps = np.flatnonzero(states > step)
+                at = offsets[:-1][warps] + self._loop_start() + len(self._loop) * step + k
+                lanes[at] = texel[warps]
+        return offsets, lanes

@@ -1,0 +1,47 @@
+"""Combine pass: scattered light times albedo plus what does not scatter."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from kernels import resources
+from kernels.access import Access
+from kernels.grid import Grid
+from kernels.method import Method
+from kernels.setup import texels
+
+
+def result_name(method: Method) -> str:
+    """The texture that holds the scattered light: the update pass writes a second one."""
+    return "resolved" if method.adaptive else "scattered"
+
+
+def accesses(method: Method) -> tuple[Access, ...]:
+    """The pass's accesses; arithmetic counts are assumed, from reading the kernel."""
+    return (
+        Access("profile_id", arithmetic=(("int", 12),)),
+        Access("scene_colour"),
+        Access(result_name(method), subsurface_only=True, arithmetic=(("int", 2),), num_outstanding=1),
+        Access("albedo", subsurface_only=True),
+        Access("output", "store", arithmetic=(("fp32", 4), ("int", 4)), num_outstanding=0),
+    )
+
+
+def reference(
+    grid: Grid, textures: dict[str, Any], method: Method
+) -> list[npt.NDArray[np.uint32]]:
+    """Write `output`; the texels of each access."""
+    mask = textures["profile_id"] > 0
+    colour = textures["scene_colour"].astype(np.float32)
+    light = textures[result_name(method)].astype(np.float32)
+    lit = colour + light * textures["albedo"].astype(np.float32)
+    output = np.where(mask[..., None], lit, colour)
+    output[..., 3] = 1
+    textures["output"] = resources.to_half(output)
+
+    everywhere = texels(grid, grid.inside)
+    scatters = texels(grid, grid.inside & grid.gather(mask).astype(np.bool_))
+    return [everywhere, everywhere, scatters, scatters, everywhere]

@@ -1,0 +1,91 @@
+"""The textures of the method: their descriptors in a trace, and what the G-buffer puts into them.
+
+Formats and levels as in Unreal Engine's passes. Memory here may be wider than the format where precision does not decide a texel.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from kernels.gbuffer import GBuffer
+from kernels.method import Method
+from traces.texture import Texture
+
+HALF_MAX = np.float32(65504.0)
+HALF_NORMAL_MIN = np.float32(2.0**-14)
+MAX_LEVELS = 6
+
+Half = npt.NDArray[np.float16]
+Float = npt.NDArray[np.float32]
+
+_FORMATS = {
+    "scene_light": "RGBA16F",
+    "depth": "R32F",
+    "gbuffer_id": "R8",
+    "normal": "RGBA8",  # 10:10:10:2 on the device: the same 4 bytes
+    "velocity": "RGBA8",  # two 16-bit components in the engine: the same 4 bytes
+    "setup": "RGBA16F",
+    "profile_id": "R8",
+    "history_0": "RGBA16F",
+    "history_1": "RGBA16F",
+    "scattered": "RGBA16F",
+    "resolved": "RGBA16F",
+    "albedo": "RGBA8",
+    "scene_colour": "RGBA16F",
+    "output": "RGBA16F",
+}
+TEXTURE_NAMES = tuple(_FORMATS)
+
+
+def count_levels(width: int, height: int, method: Method) -> int:
+    """Levels of the setup texture: at most 6, 1 without the pre-filter."""
+    return min(MAX_LEVELS, min(width, height).bit_length()) if method.prefilter else 1
+
+
+def textures(width: int, height: int, num_levels: int) -> list[Texture]:
+    """The descriptors, in the order of `TEXTURE_NAMES`."""
+    return [
+        Texture(name, fmt, width, height, num_levels if name == "setup" else 1)
+        for name, fmt in _FORMATS.items()
+    ]
+
+
+def to_half(value: Float) -> Half:
+    """Round to half floats, to nearest even; clamped to the finite range."""
+    return np.clip(value, -HALF_MAX, HALF_MAX).astype(np.float16)
+
+
+def to_setup(value: Float) -> Half:
+    """As `to_half`, with denormals and negative values made 0: what a setup texel can hold."""
+    value = np.minimum(value, HALF_MAX)
+    return np.where(value < HALF_NORMAL_MIN, np.float32(0), value).astype(np.float16)
+
+
+def _with_alpha(rgb: Float) -> Half:
+    """(h, w, 4) half floats of (h, w, 3); alpha 0."""
+    return np.concatenate([to_half(rgb), np.zeros((*rgb.shape[:2], 1), np.float16)], axis=2)
+
+
+def pack_normals(normal: Float) -> npt.NDArray[np.uint32]:
+    """(h, w) uint32: 10 bits per component, 0..1023 for -1..1, x lowest."""
+    bits = np.rint((np.clip(normal, -1, 1) + 1) * np.float32(511.5)).astype(np.uint32)
+    packed: npt.NDArray[np.uint32] = bits[..., 0] | bits[..., 1] << 10 | bits[..., 2] << 20
+    return packed
+
+
+def inputs(gbuffer: GBuffer) -> dict[str, npt.NDArray[Any]]:
+    """The contents of the textures that the G-buffer fills, by name; `velocity` only where something moves."""
+    found: dict[str, npt.NDArray[Any]] = {
+        "scene_light": _with_alpha(np.maximum(gbuffer.irradiance, np.float32(0))),
+        "depth": gbuffer.depth_cm,
+        "gbuffer_id": gbuffer.profile_id,
+        "normal": pack_normals(gbuffer.normal),
+        "albedo": _with_alpha(gbuffer.albedo),
+        "scene_colour": _with_alpha(gbuffer.non_subsurface),
+    }
+    if gbuffer.velocity is not None:
+        found["velocity"] = gbuffer.velocity
+    return {name: np.ascontiguousarray(array) for name, array in found.items()}

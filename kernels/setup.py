@@ -1,0 +1,43 @@
+"""Set-up pass: G-buffer and light in, setup texture (irradiance, depth) and profile-id cache out."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from kernels import resources
+from kernels.access import Access
+from kernels.grid import Grid
+from traces.texture import pack_texel
+
+# Arithmetic counts are assumed: from reading the kernel, not from machine code.
+ACCESSES = (
+    Access("gbuffer_id", arithmetic=(("int", 12),)),
+    Access("depth", num_outstanding=1),
+    Access("scene_light", subsurface_only=True, arithmetic=(("int", 3),), num_outstanding=0),
+    Access("setup", "store", arithmetic=(("fp32", 4), ("int", 6)), num_outstanding=0),
+    Access("profile_id", "store", arithmetic=(("int", 2),)),
+)
+
+
+def reference(
+    grid: Grid, textures: dict[str, Any]
+) -> list[npt.NDArray[np.uint32]]:
+    """Write `setup` (its level 0) and `profile_id`; the texels of each access, (num_warps, 32)."""
+    mask = (textures["gbuffer_id"] > 0) & (textures["depth"] > 0)
+    level = textures["scene_light"].astype(np.float32)
+    level[..., 3] = np.maximum(textures["depth"], resources.HALF_NORMAL_MIN)
+    textures["setup"] = [resources.to_setup(np.where(mask[..., None], level, np.float32(0)))]
+    textures["profile_id"] = np.where(mask, textures["gbuffer_id"], 0).astype(np.uint8)
+
+    everywhere = texels(grid, grid.inside)
+    scatters = texels(grid, grid.inside & grid.gather(mask).astype(np.bool_))
+    return [everywhere, everywhere, scatters, everywhere, everywhere]
+
+
+def texels(grid: Grid, active: npt.NDArray[np.bool_], mip: int = 0) -> npt.NDArray[np.uint32]:
+    """(num_warps, 32) packed texels: each active lane's own pixel."""
+    x, y = grid.lanes
+    return np.where(active, pack_texel(mip, y, x), np.uint32(0xFFFFFFFF))
