@@ -18,7 +18,16 @@ U64 = np.uint64
 
 # Primitive polynomials over GF(2) by degree, without the leading term. Degrees 4 to 6 are GPGPU-Sim's IPOLY (facts sheet 3.2,
 # verified there numerically); the others are the usual primitive ones, assumed for slice counts GPGPU-Sim has no table for.
-_POLYNOMIALS = {1: 0b1, 2: 0b11, 3: 0b011, 4: 0b0011, 5: 0b00101, 6: 0b000011, 7: 0b0000011, 8: 0b00011101}
+_POLYNOMIALS = {
+    1: 0b1,
+    2: 0b11,
+    3: 0b011,
+    4: 0b0011,
+    5: 0b00101,
+    6: 0b000011,
+    7: 0b0000011,
+    8: 0b00011101,
+}
 #: Bits of the block number that IPOLY looks at (facts sheet 3.2); 40 for the degrees GPGPU-Sim has no table for.
 _IPOLY_BITS = {4: 16, 5: 19, 6: 24}
 
@@ -93,15 +102,14 @@ def set_hash(level: CacheLevel) -> IndexHash:
 class Partition(NamedTuple):
     """How addresses spread over slices, and what is left of them inside a slice.
 
-    num_channels, slices_per_channel; interleave_bytes: run of one channel; run_bytes: run of one slice.
+    num_channels, slices_per_channel; run_shift: binary logarithm of the bytes in a row that one slice holds.
     hash: index function on the run number ("random", "ipoly") or none where kind is `MASK`/`MODULO` (plain interleave);
     xor: 1 where the channel is XORed with the bits above it.
     """
 
     num_channels: int
     slices_per_channel: int
-    interleave_bytes: int
-    run_bytes: int
+    run_shift: int
     hash: IndexHash
     xor: int
 
@@ -117,20 +125,21 @@ def partition_of(level: L2) -> Partition:
         entries = (1 << (level.num_channels - 1).bit_length()) * level.slices_per_channel
         degree = max(1, (entries - 1).bit_length())
         if degree not in _POLYNOMIALS:
-            raise ValueError(f"partition_hash = 'ipoly' with {slices} slices: allowed are up to 256")
+            raise ValueError(
+                f"partition_hash = 'ipoly' with {slices} slices: allowed are up to 256"
+            )
         index = IndexHash(TABLE, slices, _table_of_columns(ipoly_columns(degree)))
     run = level.channel_interleave // level.slices_per_channel
     return Partition(
         level.num_channels,
         level.slices_per_channel,
-        level.channel_interleave,
-        run,
+        run.bit_length() - 1,
         index,
         int(level.partition_hash == "xor"),
     )
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(cache=True, nogil=True, _nrt=False, inline="always")
 def mix64(x):  # type: ignore[no-untyped-def]
     """A uniform 64-bit hash (splitmix64's finaliser)."""
     x = (x ^ (x >> U64(30))) * U64(0xBF58476D1CE4E5B9)
@@ -138,7 +147,7 @@ def mix64(x):  # type: ignore[no-untyped-def]
     return x ^ (x >> U64(31))
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(cache=True, nogil=True, _nrt=False, inline="always")
 def index_of(number, kind, size, table):  # type: ignore[no-untyped-def]
     """The index in [0, size) of a 64-bit number under an `IndexHash`, as uint64."""
     if kind == MASK:
@@ -154,29 +163,38 @@ def index_of(number, kind, size, table):  # type: ignore[no-untyped-def]
     return U64(index) % U64(size) if size & (size - 1) else U64(index)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, _nrt=False)
 def set_indices(line, count, kind, size, table, out):  # type: ignore[no-untyped-def]
     """Write the set index of line[:count] into out[:count] (uint32)."""
     for i in range(count):
         out[i] = index_of(line[i], kind, size, table)
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(cache=True, nogil=True, _nrt=False, inline="always")
 def slice_and_line(  # type: ignore[no-untyped-def]
-    address, channels, per_channel, interleave, run, kind, slices, table, xor, line_bytes
+    address, channels, per_channel, run_shift, kind, slices, table, xor, line_shift
 ):
-    """(slice, line number inside the slice) of a byte address, both uint64.
+    """(slice, line number inside the slice) of a byte address, both uint64. channels, per_channel: uint64.
 
+    run_shift, line_shift: uint64 binary logarithms of a slice's run and of a line.
     The line number drops the channel and slice bits of the plain interleave, whatever the hash (facts sheet 3.4).
     """
-    block = address // U64(interleave)
-    row = block // U64(channels)
-    channel = block - row * U64(channels)
-    within = address & U64(run - 1)
-    if kind == MASK or kind == MODULO:
-        if xor:
-            channel ^= row & U64(channels - 1)
-        where = channel * U64(per_channel) + (address // U64(run)) % U64(per_channel)
+    run = address >> run_shift
+    if per_channel == U64(1):
+        block, within_channel = run, U64(0)
+    elif per_channel == U64(2):
+        block, within_channel = run >> U64(1), run & U64(1)
     else:
-        where = index_of(address // U64(run), kind, slices, table)
-    return where, row * U64(run // line_bytes) + within // U64(line_bytes)
+        block = run // per_channel
+        within_channel = run - block * per_channel
+    row = block // channels
+    if kind == MASK or kind == MODULO:
+        channel = block - row * channels
+        if xor:
+            channel ^= row & (channels - U64(1))
+        where = channel * per_channel + within_channel
+    else:
+        where = index_of(run, kind, slices, table)
+    lines_per_run = run_shift - line_shift
+    line = (address >> line_shift) & ((U64(1) << lines_per_run) - U64(1))
+    return where, (row << lines_per_run) | line

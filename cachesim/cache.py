@@ -16,9 +16,16 @@ from cachesim import policies
 from cachesim.config import CacheLevel
 from cachesim.stream import ATOMIC, GROUP_BITS, GROUP_MASK, LOAD, STORE, Outcome, Requests
 
+
 U64, U32, U8 = np.uint64, np.uint32, np.uint8
+
+# Places in the views of a line, beside those of `policies` (`CacheState`).
+CHAIN = U64(2)
+USED, VALID, PARTIAL, DIRTY = U64(20), U64(21), U64(22), U64(23)
+
 NO_LINE = np.uint32(0xFFFFFFFF)
-ALL_BYTES = np.uint32(0xFFFFFFFF)
+#: Of the hash of a line number to its bucket (Fibonacci hashing).
+_MULTIPLIER = np.uint64(0x9E3779B97F4A7C15)
 
 # Columns of the counters: all in the level's sectors, except REQUESTS.
 (
@@ -61,26 +68,23 @@ POPCOUNT = np.array([bin(m).count("1") for m in range(256)], np.int64)
 class CacheState(NamedTuple):
     """The arrays of all instances of a level. L = lines in all, S = sets in all, B = hash buckets in all.
 
-    tag: (L,) uint64 line number; bucket: (B,) uint32 first line of a chain, `NO_LINE` = empty; chain: (L,) uint32 next in chain.
-    used: (L,) uint8 holds a tag; valid: (L,) uint8 readable sectors; partial: (L,) uint8 sectors written in part and not readable;
-    dirty: (L,) uint8 sectors to write back.
-    newest: (S,) uint32; newer, older: (L,) uint32, `policies`' rings; tree: (S,) uint64; rrpv: (L,) uint8; fills: (S,) uint64.
+    A line is 32 bytes, half a host cache line, so that what a miss needs of its victim comes with one fetch. Three views of it:
+    tags: (4 L,) uint64, 4 l is the line number that line l holds. links: (8 L,) uint32, 8 l + `CHAIN` is the next line of its hash
+        chain, 8 l + `NEWER` and `OLDER` its set's ring (`policies`). flags: (32 L,) uint8, 32 l + `USED` holds a tag, `VALID`
+        readable sectors, `PARTIAL` sectors written in part and not readable, `DIRTY` sectors to write back, `RRPV` as SRRIP has it.
+    (Not records: numba counts references to an array for every record it takes from it, which costs twice the cache.)
+    newest: (S,) uint32 a set's most recent line. fills: (S,) uint64 tags it was given. tree: (S,) uint64 tree-PLRU's bits.
+    bucket: (B,) uint32 first line of a chain, `NO_LINE` = empty.
     bytes_held: (L, 8) uint32 bytes of each partial sector; owner: (L, 8) int32 group that dirtied a sector.
     """
 
-    tag: npt.NDArray[np.uint64]
-    bucket: npt.NDArray[np.uint32]
-    chain: npt.NDArray[np.uint32]
-    used: npt.NDArray[np.uint8]
-    valid: npt.NDArray[np.uint8]
-    partial: npt.NDArray[np.uint8]
-    dirty: npt.NDArray[np.uint8]
+    tags: npt.NDArray[np.uint64]
+    links: npt.NDArray[np.uint32]
+    flags: npt.NDArray[np.uint8]
     newest: npt.NDArray[np.uint32]
-    newer: npt.NDArray[np.uint32]
-    older: npt.NDArray[np.uint32]
-    tree: npt.NDArray[np.uint64]
-    rrpv: npt.NDArray[np.uint8]
     fills: npt.NDArray[np.uint64]
+    tree: npt.NDArray[np.uint64]
+    bucket: npt.NDArray[np.uint32]
     bytes_held: npt.NDArray[np.uint32]
     owner: npt.NDArray[np.int32]
 
@@ -101,7 +105,9 @@ class CacheRules(NamedTuple):
     bypass_stores: int
 
 
-def cache_rules(level: CacheLevel, num_instances: int, *, bypass_loads: bool, bypass_stores: bool) -> CacheRules:
+def cache_rules(
+    level: CacheLevel, num_instances: int, *, bypass_loads: bool, bypass_stores: bool
+) -> CacheRules:
     """The rules of `num_instances` caches like `level`."""
     on_hit = _ON_HIT[level.write_policy]
     return CacheRules(
@@ -124,22 +130,17 @@ def empty_state(rules: CacheRules) -> CacheState:
     sets = rules.num_instances * rules.num_sets
     lines = sets * rules.ways
     per_instance = rules.num_sets * rules.ways
-    buckets = 1 << max(4, (2 * per_instance - 1).bit_length())
+    buckets = 1 << max(4, (8 * per_instance - 1).bit_length())
     stores = 0 if rules.bypass_stores else lines
+    memory = np.zeros(4 * lines, np.uint64)
     state = CacheState(
-        tag=np.zeros(lines, np.uint64),
-        bucket=np.empty(rules.num_instances * buckets, np.uint32),
-        chain=np.zeros(lines, np.uint32),
-        used=np.zeros(lines, np.uint8),
-        valid=np.zeros(lines, np.uint8),
-        partial=np.zeros(lines, np.uint8),
-        dirty=np.zeros(lines, np.uint8),
+        tags=memory,
+        links=memory.view(np.uint32),
+        flags=memory.view(np.uint8),
         newest=np.zeros(sets, np.uint32),
-        newer=np.zeros(lines, np.uint32),
-        older=np.zeros(lines, np.uint32),
-        tree=np.zeros(sets, np.uint64),
-        rrpv=np.zeros(lines, np.uint8),
         fills=np.zeros(sets, np.uint64),
+        tree=np.zeros(sets, np.uint64),
+        bucket=np.empty(rules.num_instances * buckets, np.uint32),
         bytes_held=np.zeros((stores, 8), np.uint32),
         owner=np.zeros((stores, 8), np.int32),
     )
@@ -150,12 +151,13 @@ def empty_state(rules: CacheRules) -> CacheState:
 def reset(state: CacheState, rules: CacheRules) -> None:
     """Forget every line; nothing is written back."""
     state.bucket[:] = NO_LINE
-    for array in (state.used, state.valid, state.partial, state.dirty, state.tree, state.rrpv, state.fills):
-        array[...] = 0
-    lines = np.arange(len(state.tag), dtype=np.int64).reshape(-1, rules.ways)
+    state.tags[:] = 0
+    state.fills[:] = 0
+    state.tree[:] = 0
+    lines = np.arange(len(state.tags) // 4, dtype=np.uint32).reshape(-1, rules.ways)
     state.newest[:] = lines[:, 0]
-    state.newer.reshape(lines.shape)[:] = np.roll(lines, 1, axis=1)
-    state.older.reshape(lines.shape)[:] = np.roll(lines, -1, axis=1)
+    state.links[policies.NEWER :: 8] = np.roll(lines, 1, axis=1).ravel()
+    state.links[policies.OLDER :: 8] = np.roll(lines, -1, axis=1).ravel()
 
 
 def empty_outcome(rules: CacheRules, num_requests: int) -> Outcome:
@@ -170,40 +172,56 @@ def empty_outcome(rules: CacheRules, num_requests: int) -> Outcome:
     )
 
 
-@njit(cache=True, nogil=True, inline="always")
-def _evict(state, rules, line, i, counters, outcome):  # type: ignore[no-untyped-def]
+@njit(cache=True, nogil=True, _nrt=False)
+def _evict(  # type: ignore[no-untyped-def]
+    tags,
+    flags,
+    bytes_held,
+    owner,
+    line,
+    sectors_per_line,
+    all_bytes,
+    i,
+    counters,
+    evicted_line,
+    evicted_owner,
+    evicted_bytes,
+):
     """Count and report the write-back of a dirty line; a write-back belongs to the group that dirtied the sector."""
-    outcome.evicted_line[i] = state.tag[line]
-    dirty = state.dirty[line]
-    for s in range(rules.sectors_per_line):
+    evicted_line[i] = tags[line * U64(4)]
+    dirty = flags[line * U64(32) + DIRTY]
+    for s in range(sectors_per_line):
         if (dirty >> U8(s)) & U8(1):
-            counters[state.owner[line, s], WRITEBACKS] += 1
-            outcome.evicted_owner[i, s] = state.owner[line, s]
-            full = (state.valid[line] >> U8(s)) & U8(1)
-            outcome.evicted_bytes[i, s] = rules.all_bytes if full else state.bytes_held[line, s]
-    state.dirty[line] = 0
+            counters[owner[line, s], WRITEBACKS] += 1
+            evicted_owner[i, s] = owner[line, s]
+            full = (flags[line * U64(32) + VALID] >> U8(s)) & U8(1)
+            evicted_bytes[i, s] = all_bytes if full else bytes_held[line, s]
+    flags[line * U64(32) + DIRTY] = 0
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(cache=True, nogil=True, _nrt=False)
 def _store(state, rules, line, mask, group, operation, written, bytes_written):  # type: ignore[no-untyped-def]
     """Put a store's or atomic's sectors into a present line. Returns (sectors passed down, sectors to fetch)."""
+    flags = state.flags
     down, fill = U8(0), U8(0)
     for s in range(rules.sectors_per_line):
         bit = U8(1) << U8(s)
         if not mask & bit:
             continue
         if rules.on_hit == HIT_EVICT and operation == STORE:
-            state.valid[line] &= ~bit
-            state.partial[line] &= ~bit
+            flags[line * U64(32) + VALID] &= ~bit
+            flags[line * U64(32) + PARTIAL] &= ~bit
             down |= bit
             continue
-        readable = state.valid[line] & bit
-        held = state.bytes_held[line, s] if state.partial[line] & bit else U32(0)
+        readable = flags[line * U64(32) + VALID] & bit
+        held = state.bytes_held[line, s] if flags[line * U64(32) + PARTIAL] & bit else U32(0)
         present = readable or held
         if not present and rules.on_miss == MISS_NONE:
             down |= bit
             continue
-        covered = held | (U32(rules.all_bytes) if operation == ATOMIC else bytes_written[written, s])
+        covered = held | (
+            U32(rules.all_bytes) if operation == ATOMIC else bytes_written[written, s]
+        )
         complete = covered == U32(rules.all_bytes)
         if not readable and (
             operation == ATOMIC
@@ -213,126 +231,260 @@ def _store(state, rules, line, mask, group, operation, written, bytes_written): 
             fill |= bit
             readable = bit
         if readable or complete:
-            state.valid[line] |= bit
-            state.partial[line] &= ~bit
+            flags[line * U64(32) + VALID] |= bit
+            flags[line * U64(32) + PARTIAL] &= ~bit
         else:
-            state.partial[line] |= bit
+            flags[line * U64(32) + PARTIAL] |= bit
             state.bytes_held[line, s] = covered
         if rules.on_hit == HIT_BACK and (present or rules.on_miss != MISS_ALLOCATE):
-            state.dirty[line] |= bit
+            flags[line * U64(32) + DIRTY] |= bit
             state.owner[line, s] = group
         else:
             down |= bit
     return down, fill
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, _nrt=False, inline="always")
+def _find(tags, links, buckets, bucket, number):  # type: ignore[no-untyped-def]
+    """The line that holds a tag, or `NO_LINE`."""
+    line = buckets[bucket]
+    while line != NO_LINE and tags[line * U64(4)] != number:
+        line = links[line * U64(8) + CHAIN]
+    return line
+
+
+@njit(cache=True, nogil=True, _nrt=False, inline="always")
+def _take(  # type: ignore[no-untyped-def]
+    tags,
+    links,
+    flags,
+    newest,
+    fills,
+    tree,
+    buckets,
+    policy,
+    ways,
+    bucket,
+    first_bucket,
+    bucket_shift,
+    cache_set,
+):
+    """Give a line of the set to a new tag. What its last tag left in it is still there but for the tag: see `_clear`."""
+    line = policies.victim(policy, cache_set, ways, links, flags, newest, fills, tree)
+    if flags[line * U64(32) + USED]:
+        old = first_bucket + ((tags[line * U64(4)] * _MULTIPLIER) >> bucket_shift)
+        other = buckets[old]
+        if other == line:
+            buckets[old] = links[line * U64(8) + CHAIN]
+        else:
+            while links[other * U64(8) + CHAIN] != line:
+                other = links[other * U64(8) + CHAIN]
+            links[other * U64(8) + CHAIN] = links[line * U64(8) + CHAIN]
+    flags[line * U64(32) + USED] = 1
+    links[line * U64(8) + CHAIN] = buckets[bucket]
+    buckets[bucket] = line
+    return line
+
+
+@njit(cache=True, nogil=True, _nrt=False)
+def _other_request(  # type: ignore[no-untyped-def]
+    state, rules, requests, i, bucket, first_bucket, bucket_shift, cache_set, counters, outcome
+):
+    """A store, an atomic, or a load that bypasses."""
+    tags, links, flags = state.tags, state.links, state.flags
+    number, mask = requests.line[i], requests.mask[i]
+    operation = requests.meta[i] >> U32(GROUP_BITS)
+    group = U64(requests.meta[i] & U32(GROUP_MASK))
+    count = POPCOUNT[mask]
+    outcome.down[i] = mask
+    if len(outcome.fill):
+        outcome.fill[i] = 0
+    bypasses = rules.bypass_loads if operation == LOAD else rules.bypass_stores
+    if bypasses or (operation == ATOMIC and rules.on_hit != HIT_BACK):
+        counters[group, BYPASSES] += count
+        if operation != LOAD:
+            counters[group, BYPASSED_WRITES] += count
+        return
+    counters[group, REQUESTS] += 1
+    counters[group, ACCESSES] += count
+    counters[group, WRITES] += count
+    line = _find(tags, links, state.bucket, bucket, number)
+    if line != NO_LINE:
+        # A write hits a sector that was written in part; an atomic reads it first.
+        present = flags[line * U64(32) + VALID]
+        if operation == STORE:
+            present |= flags[line * U64(32) + PARTIAL]
+        hits = POPCOUNT[present & mask]
+        counters[group, HITS] += hits
+        counters[group, SECTOR_MISSES] += count - hits
+        counters[group, WRITE_MISSES] += count - hits
+        policies.touch(
+            rules.policy, line, cache_set, U64(rules.ways), links, flags, state.newest, state.tree
+        )
+    else:
+        counters[group, LINE_MISSES] += count
+        counters[group, WRITE_MISSES] += count
+        if rules.on_miss == MISS_NONE:
+            counters[group, STORES_DOWN] += count
+            return
+        line = _take(
+            tags,
+            links,
+            flags,
+            state.newest,
+            state.fills,
+            state.tree,
+            state.bucket,
+            rules.policy,
+            U64(rules.ways),
+            bucket,
+            first_bucket,
+            bucket_shift,
+            cache_set,
+        )
+        if rules.can_be_dirty and flags[line * U64(32) + DIRTY]:
+            _evict(
+                tags,
+                flags,
+                state.bytes_held,
+                state.owner,
+                line,
+                rules.sectors_per_line,
+                rules.all_bytes,
+                i,
+                counters,
+                outcome.evicted_line,
+                outcome.evicted_owner,
+                outcome.evicted_bytes,
+            )
+        tags[line * U64(4)] = number
+        flags[line * U64(32) + VALID] = 0
+        flags[line * U64(32) + PARTIAL] = 0
+    down, fill = _store(
+        state, rules, line, mask, group, operation, requests.written[i], requests.bytes_written
+    )
+    counters[group, STORES_DOWN] += POPCOUNT[down]
+    counters[group, WRITE_FILLS] += POPCOUNT[fill]
+    outcome.down[i] = down
+    outcome.fill[i] = fill
+
+
+@njit(cache=True, nogil=True, _nrt=False)
 def access(state, rules, requests, sets, counters, outcome):  # type: ignore[no-untyped-def]
     """Send requests to their cache instances, segment by segment.
 
     requests: `Requests`, segments of one instance in issue order. sets: (n,) uint32, set of each request in its instance.
     counters: (num_groups, NUM_COUNTERS) int64, added to. outcome: `Outcome`, zeroed by the caller where it can be dirty.
     """
+    # Arrays of a tuple are counted references; in local names the loop takes none.
+    tags, links, flags, newest, fills, tree, buckets, bytes_held, owner = state
+    down, _, evicted_line, evicted_owner, evicted_bytes = outcome
+    all_lines, all_masks, all_meta = requests.line, requests.mask, requests.meta
+    sectors_per_line, all_bytes = rules.sectors_per_line, rules.all_bytes
+    policy, can_be_dirty, bypass_loads = rules.policy, rules.can_be_dirty, rules.bypass_loads
     ways = U64(rules.ways)
-    buckets = U64(len(state.bucket) // rules.num_instances)
+    num_buckets = U64(len(buckets) // rules.num_instances)
     bucket_shift = U64(64)
-    size = buckets
+    size = num_buckets
     while size > U64(1):
         size >>= U64(1)
         bucket_shift -= U64(1)
-    multiplier = U64(0x9E3779B97F4A7C15)
     for segment in range(len(requests.instance)):
         instance = U64(requests.instance[segment])
-        first_bucket = instance * buckets
+        first_bucket = instance * num_buckets
         first_set = instance * U64(rules.num_sets)
         begin, end = U64(requests.segments[segment]), U64(requests.segments[segment + 1])
+        # Counts of a run of loads of one group stay in registers.
+        run = U32(0)
+        looked_up, asked, hits, line_misses = 0, 0, 0, 0
         for i in range(begin, end):
-            number = requests.line[i]
-            mask = requests.mask[i]
-            meta = requests.meta[i]
-            operation = meta >> U32(GROUP_BITS)
-            group = U64(meta & U32(GROUP_MASK))
-            count = POPCOUNT[mask]
-            if (
-                rules.bypass_loads
-                if operation == LOAD
-                else (rules.bypass_stores or operation == ATOMIC and rules.on_hit != HIT_BACK)
-            ):
-                counters[group, BYPASSES] += count
-                if operation != LOAD:
-                    counters[group, BYPASSED_WRITES] += count
-                outcome.down[i] = mask
-                if len(outcome.fill):
-                    outcome.fill[i] = 0
-                continue
-            counters[group, REQUESTS] += 1
-            counters[group, ACCESSES] += count
-            bucket = first_bucket + ((number * multiplier) >> bucket_shift)
+            number, mask, meta = all_lines[i], all_masks[i], all_meta[i]
+            if meta != run:
+                _add_loads(counters, run, looked_up, asked, hits, line_misses)
+                run = meta
+                looked_up, asked, hits, line_misses = 0, 0, 0, 0
+            bucket = first_bucket + ((number * _MULTIPLIER) >> bucket_shift)
             cache_set = first_set + U64(sets[i])
-
-            # Find the tag.
-            line = state.bucket[bucket]
-            while line != NO_LINE and state.tag[line] != number:
-                line = state.chain[line]
-
+            if bypass_loads or meta >> U32(GROUP_BITS) != U32(LOAD):
+                _other_request(
+                    state,
+                    rules,
+                    requests,
+                    i,
+                    bucket,
+                    first_bucket,
+                    bucket_shift,
+                    cache_set,
+                    counters,
+                    outcome,
+                )
+                continue
+            count = POPCOUNT[mask]
+            looked_up += 1
+            asked += count
+            line = _find(tags, links, buckets, bucket, number)
             if line != NO_LINE:
-                present = state.valid[line]
-                if operation == STORE:
-                    present |= state.partial[line]
-                hits = POPCOUNT[present & mask]
-                counters[group, HITS] += hits
-                counters[group, SECTOR_MISSES] += count - hits
-                if operation != LOAD:
-                    counters[group, WRITE_MISSES] += count - hits
-                policies.touch(
-                    rules.policy, line, cache_set, ways, state.newest, state.newer, state.older, state.tree, state.rrpv
-                )
+                policies.touch(policy, line, cache_set, ways, links, flags, newest, tree)
+                valid = flags[line * U64(32) + VALID]
+                hits += POPCOUNT[valid & mask]
+                down[i] = mask & ~valid
+                flags[line * U64(32) + VALID] = valid | mask
+                flags[line * U64(32) + PARTIAL] &= ~mask
             else:
-                counters[group, LINE_MISSES] += count
-                if operation != LOAD:
-                    counters[group, WRITE_MISSES] += count
-                    if rules.on_miss == MISS_NONE:
-                        counters[group, WRITES] += count
-                        counters[group, STORES_DOWN] += count
-                        outcome.down[i] = mask
-                        outcome.fill[i] = 0
-                        continue
-                # Replace a line.
-                line = policies.victim(
-                    rules.policy, cache_set, ways, state.newest, state.newer, state.tree, state.rrpv, state.fills
+                line = _take(
+                    tags,
+                    links,
+                    flags,
+                    newest,
+                    fills,
+                    tree,
+                    buckets,
+                    policy,
+                    ways,
+                    bucket,
+                    first_bucket,
+                    bucket_shift,
+                    cache_set,
                 )
-                if state.used[line]:
-                    old = first_bucket + ((state.tag[line] * multiplier) >> bucket_shift)
-                    other = state.bucket[old]
-                    if other == line:
-                        state.bucket[old] = state.chain[line]
-                    else:
-                        while state.chain[other] != line:
-                            other = state.chain[other]
-                        state.chain[other] = state.chain[line]
-                    if rules.can_be_dirty and state.dirty[line]:
-                        _evict(state, rules, line, i, counters, outcome)
-                state.used[line] = 1
-                state.tag[line] = number
-                state.chain[line] = state.bucket[bucket]
-                state.bucket[bucket] = line
-                state.valid[line] = 0
-                state.partial[line] = 0
-
-            # Fetch what a load misses, or merge a store.
-            if operation == LOAD:
-                outcome.down[i] = mask & ~state.valid[line]
-                state.valid[line] |= mask
-                state.partial[line] &= ~mask
-            else:
-                counters[group, WRITES] += count
-                down, fill = _store(
-                    state, rules, line, mask, group, operation, requests.written[i], requests.bytes_written
-                )
-                counters[group, STORES_DOWN] += POPCOUNT[down]
-                counters[group, WRITE_FILLS] += POPCOUNT[fill]
-                outcome.down[i] = down
-                outcome.fill[i] = fill
+                if can_be_dirty and flags[line * U64(32) + DIRTY]:
+                    _evict(
+                        tags,
+                        flags,
+                        bytes_held,
+                        owner,
+                        line,
+                        sectors_per_line,
+                        all_bytes,
+                        i,
+                        counters,
+                        evicted_line,
+                        evicted_owner,
+                        evicted_bytes,
+                    )
+                tags[line * U64(4)] = number
+                flags[line * U64(32) + VALID] = mask
+                flags[line * U64(32) + PARTIAL] = 0
+                line_misses += count
+                down[i] = mask
+        _add_loads(counters, run, looked_up, asked, hits, line_misses)
 
 
-__all__ = ["CacheRules", "CacheState", "access", "cache_rules", "empty_outcome", "empty_state", "reset"]
+@njit(cache=True, nogil=True, _nrt=False, inline="always")
+def _add_loads(counters, meta, looked_up, asked, hits, line_misses):  # type: ignore[no-untyped-def]
+    group = U64(meta & U32(GROUP_MASK))
+    counters[group, REQUESTS] += looked_up
+    counters[group, ACCESSES] += asked
+    counters[group, HITS] += hits
+    counters[group, LINE_MISSES] += line_misses
+    counters[group, SECTOR_MISSES] += asked - hits - line_misses
+
+
+__all__ = [
+    "CacheRules",
+    "CacheState",
+    "access",
+    "cache_rules",
+    "empty_outcome",
+    "empty_state",
+    "reset",
+]

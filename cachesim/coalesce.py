@@ -60,7 +60,8 @@ def program_of(trace: Trace) -> Program:
         bilinear=np.array([i.footprint == "bilinear" for i in trace.instructions], np.uint8),
         texture=np.array([i.texture for i in trace.instructions], np.int32),
         access_bytes=np.array(
-            [i.access_bytes or trace.textures[i.texture].texel_bytes for i in trace.instructions], np.int32
+            [i.access_bytes or trace.textures[i.texture].texel_bytes for i in trace.instructions],
+            np.int32,
         ),
         group=np.array(
             [pairs[i.pass_name, i.texture] * MAX_MIPS for i in trace.instructions], np.int32
@@ -73,7 +74,17 @@ def placement_of(address_map: AddressMap | None) -> Placement:
     if address_map is None:
         none64, none32 = np.zeros((0, MAX_MIPS), np.int64), np.zeros((0, MAX_MIPS), np.int32)
         empty = np.zeros(0, np.uint32)
-        return Placement(none64, none64, empty, empty, none64.astype(np.uint64), empty, none32, none32, none32[:, 0])
+        return Placement(
+            none64,
+            none64,
+            empty,
+            empty,
+            none64.astype(np.uint64),
+            empty,
+            none32,
+            none32,
+            none32[:, 0],
+        )
     return Placement(
         address_map.x_start,
         address_map.y_start,
@@ -91,7 +102,9 @@ def placement_of(address_map: AddressMap | None) -> Placement:
 def _texel_sector(texture, mip, y, x, place, shift):  # type: ignore[no-untyped-def]
     x_entry = place.x_tables[U64(place.x_start[texture, mip]) + x]
     y_entry = place.y_tables[U64(place.y_start[texture, mip]) + y]
-    return (place.base[texture, mip] + U64(texel_offset(x_entry, y_entry, place.low_mask[texture]))) >> shift
+    return (
+        place.base[texture, mip] + U64(texel_offset(x_entry, y_entry, place.low_mask[texture]))
+    ) >> shift
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -155,7 +168,18 @@ def _sort_distinct(keys, n, ranked, weight):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, inline="always")
 def _store_bytes(  # type: ignore[no-untyped-def]
-    row, is_texel, texture, access_bytes, place, sector_shift, line_shift, begin, end, line, written, bytes_written
+    row,
+    is_texel,
+    texture,
+    access_bytes,
+    place,
+    sector_shift,
+    line_shift,
+    begin,
+    end,
+    line,
+    written,
+    bytes_written,
 ):
     """OR the bytes that each lane writes into its request's byte masks."""
     sector_bytes = U64(1) << sector_shift
@@ -165,7 +189,11 @@ def _store_bytes(  # type: ignore[no-untyped-def]
             texel = row[lane]
             if texel == U32(0xFFFFFFFF):
                 continue
-            mip, y, x = U64(texel >> U32(28)), U64((texel >> U32(14)) & U32(16383)), U64(texel & U32(16383))
+            mip, y, x = (
+                U64(texel >> U32(28)),
+                U64((texel >> U32(14)) & U32(16383)),
+                U64(texel & U32(16383)),
+            )
             address = _texel_sector(texture, mip, y, x, place, U64(0))
         else:
             address = U64(row[lane])
@@ -183,8 +211,22 @@ def _store_bytes(  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def coalesce(  # type: ignore[no-untyped-def]
-    slots, lanes, instruction, program, place, sector_shift, line_shift, first_sector, key_of,
-    line, mask, meta, written, bytes_written, segments, lane_fetches,
+    slots,
+    lanes,
+    instruction,
+    program,
+    place,
+    sector_shift,
+    line_shift,
+    first_sector,
+    key_of,
+    line,
+    mask,
+    meta,
+    written,
+    bytes_written,
+    segments,
+    lane_fetches,
 ):
     """Coalesce the rows at `slots` of the store, in that order, into requests; returns (requests, stores) written.
 
@@ -208,7 +250,14 @@ def coalesce(  # type: ignore[no-untyped-def]
         mips[:] = 0
         if is_texel:
             n = _texel_sectors(
-                lanes[slot], texture, program.bilinear[code], place, sector_shift, first_sector, keys, mips
+                lanes[slot],
+                texture,
+                program.bilinear[code],
+                place,
+                sector_shift,
+                first_sector,
+                keys,
+                mips,
             )
             last_mip = place.last_mip[texture]
         else:
@@ -243,11 +292,30 @@ def coalesce(  # type: ignore[no-untyped-def]
             num += U64(1)
         if operation == STORE:
             _store_bytes(
-                lanes[slot], is_texel, texture, program.access_bytes[code], place, sector_shift, line_shift, begin, num,
-                line, written, bytes_written,
+                lanes[slot],
+                is_texel,
+                texture,
+                program.access_bytes[code],
+                place,
+                sector_shift,
+                line_shift,
+                begin,
+                num,
+                line,
+                written,
+                bytes_written,
             )
         segments[k + 1] = num
     return num, stores
 
 
-__all__ = ["LOAD", "Placement", "Program", "Requests", "coalesce", "groups_of", "placement_of", "program_of"]
+__all__ = [
+    "LOAD",
+    "Placement",
+    "Program",
+    "Requests",
+    "coalesce",
+    "groups_of",
+    "placement_of",
+    "program_of",
+]

@@ -55,7 +55,9 @@ def resident_ctas(sm: SM, launch: Launch) -> int:
 
 
 @njit(cache=True, nogil=True, inline="always")
-def _place(sm, place, warps_per_cta, queue, warp_first, warp_rows, next_row, rows_left, warps_left, cta_at):  # type: ignore[no-untyped-def]
+def _place(
+    sm, place, warps_per_cta, queue, warp_first, warp_rows, next_row, rows_left, warps_left, cta_at
+):  # type: ignore[no-untyped-def]
     """Put the next CTA of the queue on place `place` of an SM."""
     cta = queue[0]
     queue[0] = cta + 1
@@ -70,24 +72,62 @@ def _place(sm, place, warps_per_cta, queue, warp_first, warp_rows, next_row, row
 
 
 @njit(cache=True, nogil=True)
-def _fill_first(warps_per_cta, num_places, queue, num_queued, warp_first, warp_rows, next_row, rows_left, warps_left, cta_at):  # type: ignore[no-untyped-def]
+def _fill_first(
+    warps_per_cta,
+    num_places,
+    queue,
+    num_queued,
+    warp_first,
+    warp_rows,
+    next_row,
+    rows_left,
+    warps_left,
+    cta_at,
+):  # type: ignore[no-untyped-def]
     """Place CTAs one per SM in turn until all SMs are full."""
     for place in range(num_places):
         for sm in range(next_row.shape[0]):
             if queue[0] < num_queued:
-                _place(sm, place, warps_per_cta, queue, warp_first, warp_rows, next_row, rows_left, warps_left, cta_at)
+                _place(
+                    sm,
+                    place,
+                    warps_per_cta,
+                    queue,
+                    warp_first,
+                    warp_rows,
+                    next_row,
+                    rows_left,
+                    warps_left,
+                    cta_at,
+                )
 
 
 @njit(cache=True, nogil=True)
 def _issue(  # type: ignore[no-untyped-def]
-    warps_per_cta, units, complete, mask, queue, num_queued, warp_first, warp_rows,
-    next_row, rows_left, warps_left, cta_at, pointer, left, out_slot, out_instance,
+    warps_per_cta,
+    units,
+    complete,
+    mask,
+    queue,
+    num_queued,
+    warp_first,
+    warp_rows,
+    next_row,
+    rows_left,
+    warps_left,
+    cta_at,
+    pointer,
+    left,
+    out_slot,
+    out_instance,
 ):
     """Run whole turns until the output is full, the queue could run dry within a turn, or all is issued. Returns rows issued."""
     num_sms, num_slots = next_row.shape
     n = 0
     idle = False
-    while not idle and n + num_sms <= len(out_slot) and (complete or num_queued - queue[0] >= num_sms):
+    while (
+        not idle and n + num_sms <= len(out_slot) and (complete or num_queued - queue[0] >= num_sms)
+    ):
         idle = True
         for sm in range(num_sms):
             slot = pointer[sm]
@@ -112,7 +152,18 @@ def _issue(  # type: ignore[no-untyped-def]
                 if warps_left[sm, place] == 0:
                     left[cta_at[sm, place]] = 1
                     if queue[0] < num_queued:
-                        _place(sm, place, warps_per_cta, queue, warp_first, warp_rows, next_row, rows_left, warps_left, cta_at)
+                        _place(
+                            sm,
+                            place,
+                            warps_per_cta,
+                            queue,
+                            warp_first,
+                            warp_rows,
+                            next_row,
+                            rows_left,
+                            warps_left,
+                            cta_at,
+                        )
     return n
 
 
@@ -122,7 +173,9 @@ class Dispatcher:
     The store is a ring of rows; it grows to what the resident CTAs need and is reused by every launch.
     """
 
-    def __init__(self, sm: SM, units_per_sm: int, lanes_dtype: npt.DTypeLike, batch_rows: int) -> None:
+    def __init__(
+        self, sm: SM, units_per_sm: int, lanes_dtype: npt.DTypeLike, batch_rows: int
+    ) -> None:
         self._sm = sm
         self._units = units_per_sm
         self._batch_rows = max(batch_rows, sm.count)
@@ -162,8 +215,14 @@ class Dispatcher:
         capacity = len(self._instruction)
         at = self._head % capacity
         first = min(rows, capacity - at)
-        self._lanes[at : at + first], self._instruction[at : at + first] = lanes[:first], instruction[:first]
-        self._lanes[: rows - first], self._instruction[: rows - first] = lanes[first:], instruction[first:]
+        self._lanes[at : at + first], self._instruction[at : at + first] = (
+            lanes[:first],
+            instruction[:first],
+        )
+        self._lanes[: rows - first], self._instruction[: rows - first] = (
+            lanes[first:],
+            instruction[first:],
+        )
         counts = np.diff(offsets).reshape(-1, self._warps)
         some = counts.any(axis=1)
         starts = (self._head + offsets[:-1]).reshape(counts.shape)
@@ -182,15 +241,38 @@ class Dispatcher:
         if not self._filled:
             if not self._complete and num_queued < self._sm.count * (self._places + 1):
                 return None
-            _fill_first(self._warps, self._places, self._queue, num_queued, self._warp_first, self._warp_rows,
-                        self._next_row, self._rows_left, self._warps_left, self._cta_at)
+            _fill_first(
+                self._warps,
+                self._places,
+                self._queue,
+                num_queued,
+                self._warp_first,
+                self._warp_rows,
+                self._next_row,
+                self._rows_left,
+                self._warps_left,
+                self._cta_at,
+            )
             self._filled = True
         slot = np.empty(self._batch_rows, I64)
         instance = np.empty(self._batch_rows, np.uint32)
         n = _issue(
-            self._warps, self._units, self._complete, len(self._instruction) - 1, self._queue, num_queued,
-            self._warp_first, self._warp_rows, self._next_row, self._rows_left, self._warps_left, self._cta_at,
-            self._pointer, self._left, slot, instance,
+            self._warps,
+            self._units,
+            self._complete,
+            len(self._instruction) - 1,
+            self._queue,
+            num_queued,
+            self._warp_first,
+            self._warp_rows,
+            self._next_row,
+            self._rows_left,
+            self._warps_left,
+            self._cta_at,
+            self._pointer,
+            self._left,
+            slot,
+            instance,
         )
         return IssuedRows(slot[:n], instance[:n], self._lanes, self._instruction) if n else None
 
@@ -217,12 +299,17 @@ class Dispatcher:
         lanes = np.empty((larger, self._lanes.shape[1]), self._lanes.dtype)
         instruction = np.empty(larger, np.uint16)
         kept = np.arange(self._tail, self._head)
-        lanes[kept % larger], instruction[kept % larger] = self._lanes[kept % capacity], self._instruction[kept % capacity]
+        lanes[kept % larger], instruction[kept % larger] = (
+            self._lanes[kept % capacity],
+            self._instruction[kept % capacity],
+        )
         self._lanes, self._instruction = lanes, instruction
 
 
 @njit(cache=True, nogil=True)
-def _join(offsets, lanes, instruction, warps_per_cta, inactive, out_offsets, out_lanes, out_instruction):  # type: ignore[no-untyped-def]
+def _join(
+    offsets, lanes, instruction, warps_per_cta, inactive, out_offsets, out_lanes, out_instruction
+):  # type: ignore[no-untyped-def]
     n, out_warp = 0, 0
     for first in range(0, len(offsets) - 1, warps_per_cta):
         for w in range(0, warps_per_cta, 2):
@@ -246,7 +333,10 @@ def _join(offsets, lanes, instruction, warps_per_cta, inactive, out_offsets, out
 
 
 def join_warps(
-    offsets: npt.NDArray[np.int64], lanes: npt.NDArray[np.uint32], instruction: npt.NDArray[np.uint16], warps_per_cta: int
+    offsets: npt.NDArray[np.int64],
+    lanes: npt.NDArray[np.uint32],
+    instruction: npt.NDArray[np.uint16],
+    warps_per_cta: int,
 ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.uint32], npt.NDArray[np.uint16]]:
     """Two 32-lane warps of a CTA as one 64-lane wave: rows of the same instruction issue together.
 
@@ -258,5 +348,14 @@ def join_warps(
     out_lanes = np.empty((len(instruction), 64), lanes.dtype)
     out_instruction = np.empty(len(instruction), np.uint16)
     inactive = lanes.dtype.type(np.iinfo(lanes.dtype).max)
-    n = _join(offsets, lanes, instruction, warps_per_cta, inactive, out_offsets, out_lanes, out_instruction)
+    n = _join(
+        offsets,
+        lanes,
+        instruction,
+        warps_per_cta,
+        inactive,
+        out_offsets,
+        out_lanes,
+        out_instruction,
+    )
     return out_offsets, out_lanes[:n], out_instruction[:n]

@@ -19,7 +19,15 @@ import numpy.typing as npt
 from numba import njit
 
 from cachesim import cache
-from cachesim.address import IndexHash, Partition, index_of, partition_of, set_hash, set_indices, slice_and_line
+from cachesim.address import (
+    IndexHash,
+    Partition,
+    index_of,
+    partition_of,
+    set_hash,
+    set_indices,
+    slice_and_line,
+)
 from cachesim.coalesce import Placement, Program, coalesce
 from cachesim.config import L2, CacheLevel
 from cachesim.dispatch import IssuedRows
@@ -32,15 +40,39 @@ _NUM_BATCHES = 3
 _U64 = np.uint64
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, _nrt=False)
 def _locate_in_slices(  # type: ignore[no-untyped-def]
-    line, count, line_bytes, channels, per_channel, interleave, run, kind, slices, table, xor,
-    set_kind, num_sets, set_table, out,
+    line,
+    count,
+    line_bytes,
+    num_channels,
+    slices_per_channel,
+    run_shift,
+    kind,
+    slices,
+    table,
+    xor,
+    set_kind,
+    num_sets,
+    set_table,
+    out,
 ):
     """Set among all slices' sets, slice by slice, of each line."""
-    for i in range(count):
+    line_shift = _U64(0)
+    while (_U64(1) << line_shift) < _U64(line_bytes):
+        line_shift += _U64(1)
+    channels, per_channel = _U64(num_channels), _U64(slices_per_channel)
+    for i in range(_U64(count)):
         where, number = slice_and_line(
-            line[i] * _U64(line_bytes), channels, per_channel, interleave, run, kind, slices, table, xor, line_bytes
+            line[i] << line_shift,
+            channels,
+            per_channel,
+            _U64(run_shift),
+            kind,
+            slices,
+            table,
+            xor,
+            line_shift,
         )
         out[i] = where * _U64(num_sets) + index_of(number, set_kind, num_sets, set_table)
 
@@ -62,8 +94,14 @@ class Level:
     """One level of the hierarchy: its caches, and how requests find the one and the set that they belong to."""
 
     def __init__(
-        self, name: str, config: CacheLevel, num_instances: int, num_groups: int,
-        *, bypass_loads: bool = False, bypass_stores: bool = False,
+        self,
+        name: str,
+        config: CacheLevel,
+        num_instances: int,
+        num_groups: int,
+        *,
+        bypass_loads: bool = False,
+        bypass_stores: bool = False,
     ) -> None:
         """num_instances: cache instances that a request's SM chooses among; a sliced level counts as one of all its sets."""
         self.name = name
@@ -71,22 +109,39 @@ class Level:
         self.partition: Partition | None = partition_of(config) if isinstance(config, L2) else None
         self.hash: IndexHash = set_hash(config)
         self.rules = cache.cache_rules(
-            config, num_instances, bypass_loads=bypass_loads, bypass_stores=bypass_stores or config.write_policy == "read-only"
+            config,
+            num_instances,
+            bypass_loads=bypass_loads,
+            bypass_stores=bypass_stores or config.write_policy == "read-only",
         )
         if self.partition is not None:
             self.rules = self.rules._replace(num_sets=self.rules.num_sets * config.num_slices)  # type: ignore[attr-defined]
         self.state = cache.empty_state(self.rules)
         self.counters = np.zeros((num_groups, cache.NUM_COUNTERS), np.int64)
 
-    def sets_of(self, line: npt.NDArray[np.uint64], count: int, out: npt.NDArray[np.uint32]) -> None:
+    def sets_of(
+        self, line: npt.NDArray[np.uint64], count: int, out: npt.NDArray[np.uint32]
+    ) -> None:
         """Write the set of each line, within its instance, to out[:count]."""
         h, p = self.hash, self.partition
         if p is None:
             set_indices(line, count, h.kind, h.size, h.table, out)
         else:
             _locate_in_slices(
-                line, count, self.config.line_bytes, p.num_channels, p.slices_per_channel, p.interleave_bytes, p.run_bytes,
-                p.hash.kind, p.hash.size, p.hash.table, p.xor, h.kind, h.size, h.table, out,
+                line,
+                count,
+                self.config.line_bytes,
+                p.num_channels,
+                p.slices_per_channel,
+                p.run_shift,
+                p.hash.kind,
+                p.hash.size,
+                p.hash.table,
+                p.xor,
+                h.kind,
+                h.size,
+                h.table,
+                out,
             )
 
     def access(self, requests: Requests, sets: npt.NDArray[np.uint32], outcome: Outcome) -> None:
@@ -96,7 +151,11 @@ class Level:
     def bound_passed_down(self, num_requests: int, lower: CacheLevel) -> int:
         """How many requests to the next level a batch can become."""
         lines = max(1, self.config.line_bytes // lower.line_bytes)
-        kinds = 1 + (not self.rules.bypass_stores) + self.rules.can_be_dirty * self.rules.sectors_per_line
+        kinds = (
+            1
+            + (not self.rules.bypass_stores)
+            + self.rules.can_be_dirty * self.rules.sectors_per_line
+        )
         return num_requests * lines * kinds
 
 
@@ -134,8 +193,16 @@ class Hierarchy:
     """
 
     def __init__(
-        self, levels: list[Level], units_per_instance: list[int], program: Program, placement: Placement,
-        *, warp_size: int, texel_range: tuple[int, int] | None, num_groups: int, threaded: bool,
+        self,
+        levels: list[Level],
+        units_per_instance: list[int],
+        program: Program,
+        placement: Placement,
+        *,
+        warp_size: int,
+        texel_range: tuple[int, int] | None,
+        num_groups: int,
+        threaded: bool,
     ) -> None:
         """texel_range: (first byte, bytes) that texels lie in, or None for a lane-address trace."""
         self.levels = levels
@@ -147,7 +214,9 @@ class Hierarchy:
         self._sector_shift = _U64(levels[0].config.sector_bytes.bit_length() - 1)
         self._line_shift = _U64(levels[0].config.line_bytes.bit_length() - 1)
         narrow = texel_range is not None and texel_range[1] >> int(self._sector_shift) < 1 << 32
-        self._first_sector = _U64(texel_range[0] >> int(self._sector_shift) if narrow and texel_range else 0)
+        self._first_sector = _U64(
+            texel_range[0] >> int(self._sector_shift) if narrow and texel_range else 0
+        )
         self._key_of = np.zeros(0, np.uint32 if narrow else np.uint64)
         keys = warp_size * (4 if program.bilinear.any() else 2 if texel_range is None else 1)
         self._free: SimpleQueue[_Batch] = SimpleQueue()
@@ -160,7 +229,9 @@ class Hierarchy:
         buffers = [_Buffer(self.levels[0], num_requests, BATCH_ROWS)]
         for upper, lower in zip(self.levels, self.levels[1:], strict=False):
             num_requests = upper.bound_passed_down(num_requests, lower.config)
-            buffers.append(_Buffer(lower, num_requests, num_requests if lower.partition is None else 1))
+            buffers.append(
+                _Buffer(lower, num_requests, num_requests if lower.partition is None else 1)
+            )
         return _Batch(buffers)
 
     def process(self, rows: IssuedRows) -> None:
@@ -191,7 +262,7 @@ class Hierarchy:
         """L1s start empty at each launch: write back what is dirty in them, forget the rest."""
         self.drain()
         top = self.levels[0]
-        if top.rules.can_be_dirty and top.state.dirty.any():
+        if top.rules.can_be_dirty and top.state.flags[cache.DIRTY :: 32].any():
             self._write_back_all(0)
         cache.reset(top.state, top.rules)
 
@@ -201,7 +272,7 @@ class Hierarchy:
         count = np.zeros(len(self.lane_fetches), np.int64)
         if level.rules.can_be_dirty:
             for s in range(level.rules.sectors_per_line):
-                dirty = (level.state.dirty >> s) & 1 == 1
+                dirty = (level.state.flags[cache.DIRTY :: 32] >> s) & 1 == 1
                 count += np.bincount(level.state.owner[dirty, s], minlength=len(count))
         return count
 
@@ -226,16 +297,30 @@ class Hierarchy:
         requests = buffer.requests
         num = len(by_unit)
         coalesce(
-            rows.slot[by_unit], rows.lanes, rows.instruction, self._program, self._placement,
-            self._sector_shift, self._line_shift, self._first_sector, self._key_of,
-            requests.line, requests.mask, requests.meta, requests.written, requests.bytes_written,
-            requests.segments, self.lane_fetches,
+            rows.slot[by_unit],
+            rows.lanes,
+            rows.instruction,
+            self._program,
+            self._placement,
+            self._sector_shift,
+            self._line_shift,
+            self._first_sector,
+            self._key_of,
+            requests.line,
+            requests.mask,
+            requests.meta,
+            requests.written,
+            requests.bytes_written,
+            requests.segments,
+            self.lane_fetches,
         )
         requests.instance[:num] = rows.instance[by_unit]
         requests.order[by_unit] = np.arange(num)
         self.num_rows += num
         batch.requests = requests._replace(
-            segments=requests.segments[: num + 1], instance=requests.instance[:num], order=requests.order[:num]
+            segments=requests.segments[: num + 1],
+            instance=requests.instance[:num],
+            order=requests.order[:num],
         )
 
     def _first_level(self, batch: _Batch) -> None:
@@ -264,7 +349,10 @@ class Hierarchy:
         for upper in range(index, len(self.levels) - 1):
             lower = upper + 1
             passed: list[Requests] = []
-            self._timed("route", lambda u=upper, r=requests, p=passed: p.append(self._pass_down(u, r, buffers)))
+            self._timed(
+                "route",
+                lambda u=upper, r=requests, p=passed: p.append(self._pass_down(u, r, buffers)),
+            )
             requests = passed[0]
             self._timed(self.levels[lower].name, self._access, lower, requests, buffers[lower])
 
@@ -272,40 +360,61 @@ class Hierarchy:
         upper, lower, buffer = self.levels[index], self.levels[index + 1], buffers[index + 1]
         out = buffer.requests
         num, _ = pass_down(
-            requests, buffers[index].outcome, upper.config.line_bytes, upper.config.sector_bytes,
-            lower.config.line_bytes, lower.config.sector_bytes,
-            out.line, out.mask, out.meta, out.written, out.bytes_written, buffer.position,
+            requests,
+            buffers[index].outcome,
+            upper.config.line_bytes,
+            upper.config.sector_bytes,
+            lower.config.line_bytes,
+            lower.config.sector_bytes,
+            out.line,
+            out.mask,
+            out.meta,
+            out.written,
+            out.bytes_written,
+            buffer.position,
         )
         if lower.partition is None:
             ratio = self._units[index + 1] // self._units[index]
             runs = _segments_of_positions(
-                buffer.position, num, requests.instance // np.uint32(ratio), out.segments, out.instance
+                buffer.position,
+                num,
+                requests.instance // np.uint32(ratio),
+                out.segments,
+                out.instance,
             )
         else:
             runs, out.segments[1], out.segments[0] = 1, num, 0
             out.instance[0] = 0
         out.order[:runs] = np.arange(runs)
-        return out._replace(segments=out.segments[: runs + 1], instance=out.instance[:runs], order=out.order[:runs])
+        return out._replace(
+            segments=out.segments[: runs + 1], instance=out.instance[:runs], order=out.order[:runs]
+        )
 
     def _write_back_all(self, index: int) -> None:
         """Write back every dirty line of a level, in line order, as stores to the next one."""
         level = self.levels[index]
         state, rules = level.state, level.rules
-        lines = np.flatnonzero(state.dirty)
+        lines = np.flatnonzero(state.flags[cache.DIRTY :: 32])
         upper = Requests(
-            line=state.tag[lines], mask=np.zeros(len(lines), np.uint8),
-            meta=np.full(len(lines), STORE << GROUP_BITS, np.uint32), written=np.zeros(len(lines), np.int32),
-            bytes_written=np.zeros((1, 8), np.uint32), segments=np.arange(len(lines) + 1),
-            instance=(lines // (rules.num_sets * rules.ways)).astype(np.uint32), order=np.arange(len(lines)),
+            line=state.tags[::4][lines],
+            mask=np.zeros(len(lines), np.uint8),
+            meta=np.full(len(lines), STORE << GROUP_BITS, np.uint32),
+            written=np.zeros(len(lines), np.int32),
+            bytes_written=np.zeros((1, 8), np.uint32),
+            segments=np.arange(len(lines) + 1),
+            instance=(lines // (rules.num_sets * rules.ways)).astype(np.uint32),
+            order=np.arange(len(lines)),
         )
         buffer = _Buffer(level, len(lines), 1)
         for s in range(rules.sectors_per_line):
-            dirty = (state.dirty[lines] >> s) & 1 == 1
+            dirty = (state.flags[cache.DIRTY :: 32][lines] >> s) & 1 == 1
             owner = state.owner[lines[dirty], s]
             np.add.at(level.counters[:, cache.WRITEBACKS], owner, 1)
             buffer.outcome.evicted_owner[dirty, s] = owner
-            full = (state.valid[lines] >> s) & 1 == 1
-            buffer.outcome.evicted_bytes[:, s] = np.where(full, rules.all_bytes, state.bytes_held[lines, s])
+            full = (state.flags[cache.VALID :: 32][lines] >> s) & 1 == 1
+            buffer.outcome.evicted_bytes[:, s] = np.where(
+                full, rules.all_bytes, state.bytes_held[lines, s]
+            )
         buffer.outcome.evicted_line[:] = upper.line
         buffers = self._new_batch(len(lines)).buffers
         buffers[index] = buffer

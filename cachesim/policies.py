@@ -18,6 +18,7 @@ from numba import njit
 
 from cachesim.address import mix64
 
+
 LRU, FIFO, TREE_PLRU, RANDOM, SRRIP = range(5)
 CODES = {"lru": LRU, "fifo": FIFO, "tree-plru": TREE_PLRU, "random": RANDOM, "srrip": SRRIP}
 
@@ -27,24 +28,27 @@ SRRIP_NEW, SRRIP_MAX = 2, 3
 U64 = np.uint64
 U32 = np.uint32
 
+# Places in a line's views, as `cachesim.cache.CacheState` describes them.
+NEWER, OLDER, RRPV = U64(3), U64(4), U64(24)
 
-@njit(cache=True, nogil=True, inline="always")
-def _to_front(line, cache_set, newest, newer, older):  # type: ignore[no-untyped-def]
-    """Make `line` the newest of its set's ring. older[newest] walks back in time; newer[newest] is the oldest line."""
+
+@njit(cache=True, nogil=True, _nrt=False, inline="always")
+def _to_front(line, cache_set, links, newest):  # type: ignore[no-untyped-def]
+    """Make `line` the newest of its set's ring. links[newest * U64(8) + OLDER] walks back in time; links[newest * U64(8) + NEWER] is the oldest line."""
     front = newest[cache_set]
     if line != front:
-        before, after = newer[line], older[line]
-        older[before] = after
-        newer[after] = before
-        oldest = newer[front]
-        newer[front] = line
-        older[line] = front
-        newer[line] = oldest
-        older[oldest] = line
+        before, after = links[line * U64(8) + NEWER], links[line * U64(8) + OLDER]
+        links[before * U64(8) + OLDER] = after
+        links[after * U64(8) + NEWER] = before
+        oldest = links[front * U64(8) + NEWER]
+        links[front * U64(8) + NEWER] = line
+        links[line * U64(8) + OLDER] = front
+        links[line * U64(8) + NEWER] = oldest
+        links[oldest * U64(8) + OLDER] = line
         newest[cache_set] = line
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(cache=True, nogil=True, _nrt=False, inline="always")
 def _point_away(way, ways, cache_set, tree):  # type: ignore[no-untyped-def]
     """Set the tree bits on the path to `way` so that they point to the other side."""
     bits = tree[cache_set]
@@ -62,7 +66,7 @@ def _point_away(way, ways, cache_set, tree):  # type: ignore[no-untyped-def]
     tree[cache_set] = bits
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(cache=True, nogil=True, _nrt=False, inline="always")
 def _pointed_way(ways, cache_set, tree):  # type: ignore[no-untyped-def]
     """The way the tree points to; a side without ways (ways not a power of two) is never taken."""
     bits = tree[cache_set]
@@ -78,23 +82,23 @@ def _pointed_way(ways, cache_set, tree):  # type: ignore[no-untyped-def]
     return low
 
 
-@njit(cache=True, nogil=True, inline="always")
-def touch(policy, line, cache_set, ways, newest, newer, older, tree, rrpv):  # type: ignore[no-untyped-def]
+@njit(cache=True, nogil=True, _nrt=False, inline="always")
+def touch(policy, line, cache_set, ways, links, flags, newest, tree):  # type: ignore[no-untyped-def]
     """A present line was accessed."""
     if policy == LRU:
-        _to_front(line, cache_set, newest, newer, older)
+        _to_front(line, cache_set, links, newest)
     elif policy == TREE_PLRU:
         _point_away(U64(line) - U64(cache_set) * ways, ways, cache_set, tree)
     elif policy == SRRIP:
-        rrpv[line] = 0
+        flags[line * U64(32) + RRPV] = 0
 
 
-@njit(cache=True, nogil=True, inline="always")
-def victim(policy, cache_set, ways, newest, newer, tree, rrpv, fills):  # type: ignore[no-untyped-def]
+@njit(cache=True, nogil=True, _nrt=False, inline="always")
+def victim(policy, cache_set, ways, links, flags, newest, fills, tree):  # type: ignore[no-untyped-def]
     """The line of the set that a new tag replaces, marked as just inserted. Unused lines go first, in way order."""
     first = U64(cache_set) * ways
     if policy == LRU or policy == FIFO:
-        line = newer[newest[cache_set]]
+        line = links[newest[cache_set] * U64(8) + NEWER]
         newest[cache_set] = line
         return line
     count = fills[cache_set]
@@ -109,14 +113,14 @@ def victim(policy, cache_set, ways, newest, newer, tree, rrpv, fills):  # type: 
         way = ways
         while way == ways:
             for w in range(ways):
-                if rrpv[first + U64(w)] == SRRIP_MAX:
+                if flags[(first + U64(w)) * U64(32) + RRPV] == SRRIP_MAX:
                     way = U64(w)
                     break
             if way == ways:
                 for w in range(ways):
-                    rrpv[first + U64(w)] += np.uint8(1)
+                    flags[(first + U64(w)) * U64(32) + RRPV] += np.uint8(1)
     if policy == TREE_PLRU:
         _point_away(way, ways, cache_set, tree)
     elif policy == SRRIP:
-        rrpv[first + way] = SRRIP_NEW
+        flags[(first + way) * U64(32) + RRPV] = SRRIP_NEW
     return U32(first + way)

@@ -71,7 +71,9 @@ class LevelCounters:
     def __add__(self, other: LevelCounters) -> LevelCounters:
         """Counters over the union of two populations of one level."""
         if self.sector_bytes != other.sector_bytes:
-            raise ValueError(f"sector_bytes {self.sector_bytes} and {other.sector_bytes} do not add")
+            raise ValueError(
+                f"sector_bytes {self.sector_bytes} and {other.sector_bytes} do not add"
+            )
         added = {f.name: getattr(self, f.name) + getattr(other, f.name) for f in fields(self)}
         return LevelCounters(**(added | {"sector_bytes": self.sector_bytes}))
 
@@ -163,16 +165,31 @@ class Report:
         for upper, lower in zip(names, names[1:], strict=False):
             u, d = self.counters[upper], self.counters[lower]
             passed = (u.reads_down + u.writes_down) * u.sector_bytes
-            _law(f"{upper} passes down what {lower} is presented", passed, d.presented * d.sector_bytes)
+            _law(
+                f"{upper} passes down what {lower} is presented",
+                passed,
+                d.presented * d.sector_bytes,
+            )
         last = self.counters[names[-1]]
         moved = (last.reads_down + last.writes_down) * last.sector_bytes
         _law(f"{names[-1]} passes down what DRAM moves", moved, self.dram.bytes)
         if self.parts is not None:
             for name in names:
-                total = sum((p.counters[name] for p in self.parts), LevelCounters(self.counters[name].sector_bytes))
+                total = sum(
+                    (p.counters[name] for p in self.parts),
+                    LevelCounters(self.counters[name].sector_bytes),
+                )
                 _law(f"{name}: parts sum to the total", self.counters[name], total)
-            _law("lane fetches: parts sum to the total", self.lane_fetches, sum(p.lane_fetches for p in self.parts))
-            _law("dram: parts sum to the total", self.dram.bytes, sum(p.dram.bytes for p in self.parts))
+            _law(
+                "lane fetches: parts sum to the total",
+                self.lane_fetches,
+                sum(p.lane_fetches for p in self.parts),
+            )
+            _law(
+                "dram: parts sum to the total",
+                self.dram.bytes,
+                sum(p.dram.bytes for p in self.parts),
+            )
 
     def to_json(self) -> dict[str, Any]:
         """The report of the design's contract, JSON-able."""
@@ -207,7 +224,8 @@ class Report:
     def frame(self) -> pd.DataFrame:
         """One row per level: the counters, `misses`, `miss_rate` and `demand_bytes`."""
         rows = [
-            {"level": n, **c.to_json(), "demand_bytes": self.demand[f"{n}_bytes"]} for n, c in self.counters.items()
+            {"level": n, **c.to_json(), "demand_bytes": self.demand[f"{n}_bytes"]}
+            for n, c in self.counters.items()
         ]
         return pd.DataFrame(rows).astype({"miss_rate": float})
 
@@ -215,9 +233,15 @@ class Report:
         """One row per pass x texture x mip x level; DRAM is a level of its own with `bytes`. Empty without provenance."""
         rows: list[dict[str, Any]] = []
         for p in self.parts or ():
-            key = {"pass": p.pass_name, "texture": p.texture, "mip": p.mip, "lane_fetches": p.lane_fetches}
+            key = {
+                "pass": p.pass_name,
+                "texture": p.texture,
+                "mip": p.mip,
+                "lane_fetches": p.lane_fetches,
+            }
             rows += [
-                {**key, "level": n, **c.to_json(), "bytes": c.presented * c.sector_bytes} for n, c in p.counters.items()
+                {**key, "level": n, **c.to_json(), "bytes": c.presented * c.sector_bytes}
+                for n, c in p.counters.items()
             ]
             rows.append({**key, "level": "dram", **p.dram.to_json()})
         return pd.DataFrame(rows)

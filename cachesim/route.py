@@ -29,8 +29,18 @@ def _scaled_bytes(bits, upper_sector_bytes, lower_sector_bytes, part, lower_all)
 
 @njit(cache=True, nogil=True)
 def pass_down(  # type: ignore[no-untyped-def]
-    requests, outcome, upper_line_bytes, upper_sector_bytes, lower_line_bytes, lower_sector_bytes,
-    line, mask, meta, written, bytes_written, position,
+    requests,
+    outcome,
+    upper_line_bytes,
+    upper_sector_bytes,
+    lower_line_bytes,
+    lower_sector_bytes,
+    line,
+    mask,
+    meta,
+    written,
+    bytes_written,
+    position,
 ):
     """Write the next level's requests into line, mask, meta, written, bytes_written; returns (requests, stores) written.
 
@@ -64,12 +74,33 @@ def pass_down(  # type: ignore[no-untyped-def]
                     for s in range(sectors):
                         if not (todo >> np.uint8(s)) & np.uint8(1):
                             continue
-                        bits = requests.bytes_written[requests.written[i], s] if passed == STORE else U32(0)
+                        bits = (
+                            requests.bytes_written[requests.written[i], s]
+                            if passed == STORE
+                            else U32(0)
+                        )
                         num, stores = _append(
-                            requests.line[i], s, bits, passed, group, segment,
-                            upper_line_bytes, upper_sector_bytes, lower_line_bytes, lower_sector_bytes, parts, lower_all,
+                            requests.line[i],
+                            s,
+                            bits,
+                            passed,
+                            group,
+                            segment,
+                            upper_line_bytes,
+                            upper_sector_bytes,
+                            lower_line_bytes,
+                            lower_sector_bytes,
+                            parts,
+                            lower_all,
                             s == 0 or not (todo & ((np.uint8(1) << np.uint8(s)) - np.uint8(1))),
-                            line, mask, meta, written, bytes_written, position, num, stores,
+                            line,
+                            mask,
+                            meta,
+                            written,
+                            bytes_written,
+                            position,
+                            num,
+                            stores,
                         )
             if len(outcome.evicted_owner):
                 first = True
@@ -81,9 +112,27 @@ def pass_down(  # type: ignore[no-untyped-def]
                     if s > 0 and not first:
                         first = meta[num - U64(1)] & U32(GROUP_MASK) != U32(owner)
                     num, stores = _append(
-                        outcome.evicted_line[i], s, outcome.evicted_bytes[i, s], U32(STORE), U32(owner), segment,
-                        upper_line_bytes, upper_sector_bytes, lower_line_bytes, lower_sector_bytes, parts, lower_all,
-                        first, line, mask, meta, written, bytes_written, position, num, stores,
+                        outcome.evicted_line[i],
+                        s,
+                        outcome.evicted_bytes[i, s],
+                        U32(STORE),
+                        U32(owner),
+                        segment,
+                        upper_line_bytes,
+                        upper_sector_bytes,
+                        lower_line_bytes,
+                        lower_sector_bytes,
+                        parts,
+                        lower_all,
+                        first,
+                        line,
+                        mask,
+                        meta,
+                        written,
+                        bytes_written,
+                        position,
+                        num,
+                        stores,
                     )
                     first = False
     return num, stores
@@ -91,16 +140,36 @@ def pass_down(  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, inline="always")
 def _append(  # type: ignore[no-untyped-def]
-    upper_line, sector, bits, operation, group, segment,
-    upper_line_bytes, upper_sector_bytes, lower_line_bytes, lower_sector_bytes, parts, lower_all,
-    is_first, line, mask, meta, written, bytes_written, position, num, stores,
+    upper_line,
+    sector,
+    bits,
+    operation,
+    group,
+    segment,
+    upper_line_bytes,
+    upper_sector_bytes,
+    lower_line_bytes,
+    lower_sector_bytes,
+    parts,
+    lower_all,
+    is_first,
+    line,
+    mask,
+    meta,
+    written,
+    bytes_written,
+    position,
+    num,
+    stores,
 ):
     """Append one upper sector to the lower requests: to the last one where it is the same access and line, else as a new one."""
     for part in range(parts):
         offset = U64(sector * upper_sector_bytes + part * lower_sector_bytes)
         # Only the number of the line is kept: a line number times its size may not fit in 64 bits when it is off by one.
         if lower_line_bytes <= upper_line_bytes:
-            lower = upper_line * U64(upper_line_bytes // lower_line_bytes) + offset // U64(lower_line_bytes)
+            lower = upper_line * U64(upper_line_bytes // lower_line_bytes) + offset // U64(
+                lower_line_bytes
+            )
             within = offset % U64(lower_line_bytes)
         else:
             ratio = U64(lower_line_bytes // upper_line_bytes)
@@ -118,8 +187,10 @@ def _append(  # type: ignore[no-untyped-def]
             num += U64(1)
         mask[num - U64(1)] |= np.uint8(1) << np.uint8(lower_sector)
         if operation == STORE:
-            scaled = bits if parts == 1 else _scaled_bytes(
-                bits, upper_sector_bytes, lower_sector_bytes, part, lower_all
+            scaled = (
+                bits
+                if parts == 1
+                else _scaled_bytes(bits, upper_sector_bytes, lower_sector_bytes, part, lower_all)
             )
             bytes_written[stores - 1, lower_sector] = scaled
     return num, stores

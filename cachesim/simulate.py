@@ -1,6 +1,6 @@
 """Simulate: a trace and a GPU in, a `Report` out.
 
-    trace ──► place texels ──► dispatch ──► coalesce ──► L1 ──► L2 ──► DRAM ──► report
+trace ──► place texels ──► dispatch ──► coalesce ──► L1 ──► L2 ──► DRAM ──► report
 """
 
 from __future__ import annotations
@@ -50,7 +50,13 @@ def simulate(
         ConservationError: a law of the report is broken.
     """
     return simulate_all(
-        trace, [gpu], fetch_path=fetch_path, layout=layout, layouts=layouts, threaded=threaded, progress=progress
+        trace,
+        [gpu],
+        fetch_path=fetch_path,
+        layout=layout,
+        layouts=layouts,
+        threaded=threaded,
+        progress=progress,
     )[0]
 
 
@@ -68,7 +74,8 @@ def simulate_all(
     chosen = [presets.load(g) if isinstance(g, str) else g for g in gpus]
     alone = len(chosen) == 1
     models = [
-        _Model(trace, gpu, fetch_path, layout, layouts or {}, threaded=threaded and alone) for gpu in chosen
+        _Model(trace, gpu, fetch_path, layout, layouts or {}, threaded=threaded and alone)
+        for gpu in chosen
     ]
     try:
         with ThreadPoolExecutor(len(models) if threaded and not alone else 1) as pool:
@@ -86,8 +93,14 @@ class _Model:
     """One GPU's way through the stages."""
 
     def __init__(
-        self, trace: Trace, gpu: Gpu, fetch_path: str | None, layout: str | None, layouts: Mapping[str, str],
-        *, threaded: bool,
+        self,
+        trace: Trace,
+        gpu: Gpu,
+        fetch_path: str | None,
+        layout: str | None,
+        layouts: Mapping[str, str],
+        *,
+        threaded: bool,
     ) -> None:
         self._trace, self._gpu = trace, gpu
         default = gpu.lane_address_path if trace.is_lane_address else "texture"
@@ -95,7 +108,9 @@ class _Model:
         if self._fetch_path not in FETCH_PATHS:
             raise unknown("fetch path", self._fetch_path, FETCH_PATHS)
         self._layout = None if trace.is_lane_address else layout or gpu.texture_layout
-        address_map = place(trace.textures, self._layout, overrides=layouts) if self._layout else None
+        address_map = (
+            place(trace.textures, self._layout, overrides=layouts) if self._layout else None
+        )
         self._pairs = groups_of(trace)
         num_groups = max(1, len(self._pairs)) * MAX_MIPS
         levels, units = hierarchy_levels(gpu, self._fetch_path, num_groups)
@@ -107,7 +122,9 @@ class _Model:
             program_of(trace),
             placement_of(address_map),
             warp_size=gpu.sm.warp_size,
-            texel_range=(address_map.base_address, address_map.footprint_bytes) if address_map else None,
+            texel_range=(address_map.base_address, address_map.footprint_bytes)
+            if address_map
+            else None,
             num_groups=num_groups,
             threaded=threaded,
         )
@@ -166,12 +183,17 @@ class _Model:
                 if fetches or any(c.presented or c.writebacks for c in counters.values()):
                     parts.append(part)
         counters = {
-            level.name: _counters(level, slice(None), int(dirty[k].sum())) for k, level in enumerate(levels)
+            level.name: _counters(level, slice(None), int(dirty[k].sum()))
+            for k, level in enumerate(levels)
         }
         manifest = self._trace.manifest
         return Report(
             gpu=gpu.name,
-            trace={k: manifest[k] for k in ("name", "scene", "method", "size", "frames", "seed") if k in manifest},
+            trace={
+                k: manifest[k]
+                for k in ("name", "scene", "method", "size", "frames", "seed")
+                if k in manifest
+            },
             fetch_path=self._fetch_path,
             layout=self._layout,
             num_rows=hierarchy.num_rows,
@@ -209,7 +231,9 @@ def hierarchy_levels(gpu: Gpu, fetch_path: str, num_groups: int) -> tuple[list[L
     return levels, sharing
 
 
-def _check_sectors(gpu: Gpu, upper_name: str, upper: CacheLevel, lower_name: str, lower: CacheLevel) -> None:
+def _check_sectors(
+    gpu: Gpu, upper_name: str, upper: CacheLevel, lower_name: str, lower: CacheLevel
+) -> None:
     if upper.sector_bytes % lower.sector_bytes:
         raise InputError(
             f"{gpu.name}: {lower_name}.sector_bytes = {lower.sector_bytes}: must divide {upper_name}.sector_bytes = "

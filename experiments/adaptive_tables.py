@@ -56,12 +56,12 @@ def demand_table(demand: pd.DataFrame, ratios: pd.DataFrame, title: str, size: s
         Column("scene", "scene"),
         Column("gpu", "GPU"),
         Column("method", "method"),
-        Column("lane_fetches", "lane fetches (M)", "right"),
-        Column("l1_bytes", "L1 demand (MB)", "right"),
-        Column("l2_bytes", "L2 demand (MB)", "right"),
-        Column("dram_bytes", "DRAM (MB)", "right"),
-        Column("l1_miss_rate", "L1 miss rate", "right"),
-        Column("l2_miss_rate", "L2 miss rate", "right"),
+        Column("lane_fetches", "lane fetches (M)", numeric=True),
+        Column("l1_bytes", "L1 demand (MB)", numeric=True),
+        Column("l2_bytes", "L2 demand (MB)", numeric=True),
+        Column("dram_bytes", "DRAM (MB)", numeric=True),
+        Column("l1_miss_rate", "L1 miss rate", numeric=True),
+        Column("l2_miss_rate", "L2 miss rate", numeric=True),
     )
     return Table(title, pd.DataFrame(rows), columns, tuple(findings(demand, ratios, size)))
 

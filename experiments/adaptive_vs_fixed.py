@@ -132,15 +132,11 @@ def demand_frame(results: Sequence[SceneResult]) -> pd.DataFrame:
     for result in results:
         for method in METHODS:
             for report in result.reports[method]:
-                demand = report.demand
                 row: dict[str, Any] = {
                     "scene": result.label,
                     "gpu": report.gpu,
                     "method": method,
-                    "lane_fetches": demand.lane_fetches,
-                    "l1_bytes": demand.l1_bytes,
-                    "l2_bytes": demand.l2_bytes,
-                    "dram_bytes": demand.dram_bytes,
+                    **report.demand,
                 }
                 for level in report.levels:
                     row[f"{level}_miss_rate"] = report.counters[level].miss_rate
@@ -170,26 +166,22 @@ def mip_frame(results: Sequence[SceneResult]) -> pd.DataFrame:
     for result in results:
         for method in METHODS:
             for report in result.reports[method]:
-                for part in report.by or ():
-                    is_mipped = part["texture"] == MIPPED_TEXTURE
-                    rows.append(
-                        {
-                            "scene": result.label,
-                            "gpu": report.gpu,
-                            "method": method,
-                            "part": f"mip {part['mip']}" if is_mipped else "other",
-                            "lane_fetches": part["lane_fetches"],
-                            "l1_accesses": part["l1"]["accesses"],
-                            "l1_misses": part["l1"]["misses"],
-                            "l1_bytes": part["l1"]["accesses"]
-                            * report.counters["l1"].sector_bytes,
-                            "l2_accesses": part["l2"]["accesses"],
-                            "l2_misses": part["l2"]["misses"],
-                            "l2_bytes": part["l2"]["accesses"]
-                            * report.counters["l2"].sector_bytes,
-                            "dram_bytes": part["dram"]["bytes"],
-                        }
-                    )
+                for part in report.parts or ():
+                    is_mipped = part.texture == MIPPED_TEXTURE
+                    row = {
+                        "scene": result.label,
+                        "gpu": report.gpu,
+                        "method": method,
+                        "part": f"mip {part.mip}" if is_mipped else "other",
+                        "lane_fetches": part.lane_fetches,
+                        "dram_bytes": part.dram.bytes,
+                    }
+                    for level in ("l1", "l2"):
+                        counts = part.counters[level]
+                        row[f"{level}_accesses"] = counts.accesses
+                        row[f"{level}_misses"] = counts.misses
+                        row[f"{level}_bytes"] = counts.presented * counts.sector_bytes
+                    rows.append(row)
     keys = ["scene", "gpu", "method", "part"]
     frame = pd.DataFrame(rows).groupby(keys, sort=False).sum().reset_index()
     for level in ("l1", "l2"):

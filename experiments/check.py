@@ -8,13 +8,13 @@ from experiments.options import TracePath
 
 
 def command(trace: TracePath) -> None:
-    """Check a trace: order and completeness of launches and CTAs, texels inside their levels, masks, sizes."""
+    """Check a trace: launches and CTAs complete and in order, texels inside their levels, sizes."""
     from experiments.console import progress
     from traces.check import check
     from traces.open import open_trace
 
     with progress(f"checking {trace.name}") as bar:
-        found = check(open_trace(trace), str(trace), progress=lambda _: bar.advance())
+        found = check(open_trace(trace), str(trace), progress=bar.update)
     print(
         f"{trace}: sound: {found.num_launches:,} launches, {found.num_ctas:,} CTAs, "
         f"{found.num_rows:,} accesses, {found.num_lane_fetches:,} lane fetches"

@@ -1,7 +1,8 @@
-"""The `cachesim` command: one module per command, and one place that turns errors into a line and an exit code.
+"""The `cachesim` command: one module per command, and one place for errors and exit codes.
 
-Exit codes: 0 done, 2 bad input, 1 failed while working, 130 interrupted. Modules of commands import what they use inside the
-function, so that `--help` is quick and commands on saved traces never load OpenCL.
+Exit codes: 0 done, 2 bad input, 1 failed while working, 130 interrupted. Modules of commands
+import what they use inside the function, so that `--help` is quick and commands on saved traces
+never load OpenCL.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ DONE, FAILED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
 
 app = typer.Typer(
     name="cachesim",
-    help="Simulate the GPU caches under screen-space subsurface scattering: render, record, count, compare.",
+    help="GPU caches under screen-space subsurface scattering: render, record, count, compare.",
     no_args_is_help=True,
     add_completion=False,
     rich_markup_mode=None,
@@ -70,7 +71,7 @@ def run_command(arguments: Sequence[str] | None = None) -> int:
     except InputError as error:
         return _fail(BAD_INPUT, str(error))
     except typer.TyperException as error:
-        return _fail(BAD_INPUT, error.format_message())
+        return _fail(BAD_INPUT, describe_usage_error(error, arguments or sys.argv[1:]))
     except (KeyboardInterrupt, typer.Abort):
         code = INTERRUPTED
     except WorkError as error:
@@ -81,6 +82,18 @@ def run_command(arguments: Sequence[str] | None = None) -> int:
         return _fail(FAILED, describe_os_error(error))
     # Typer hands an interrupt inside a command on as an exit code.
     return _fail(INTERRUPTED, "interrupted") if code == INTERRUPTED else int(code or DONE)
+
+
+def describe_usage_error(error: typer.TyperException, arguments: Sequence[str]) -> str:
+    """Typer's message, with the value that it leaves out where an option's is refused."""
+    message = error.format_message()
+    param = error.param if isinstance(error, typer.BadParameter) else None
+    for name in param.opts if param is not None else ():
+        for argument, following in zip(arguments, [*arguments[1:], ""], strict=True):
+            option, _, value = argument.partition("=")
+            if option == name and argument.startswith("-"):
+                return f"{name} {value or following!r}: {message}"
+    return message
 
 
 def describe_os_error(error: OSError) -> str:

@@ -1,2 +1,166 @@
-def command() -> None:
-    """x"""
+"""`cachesim demo`: fixed against adaptive on three scenes and three GPUs, as tables and pictures."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from experiments.options import AlbedoMap, DeviceName, Folder, NormalMap, parse_names
+
+if TYPE_CHECKING:
+    from cachesim.config import Gpu
+    from experiments.adaptive_vs_fixed import SceneResult
+    from kernels.device import Device
+
+SCENES = "close,ear,front"
+GPUS = "titan-x-pascal,rtx-2080-ti,rx-5700-xt"
+SIZE, FULL_SIZE = "960x540", "1920x1080"
+#: Seconds per megapixel and scene that scatters everywhere, counted on three GPUs, two cores.
+SECONDS_PER_MEGAPIXEL = 50.0
+MESH_HELP = "A mesh instead of the procedural head; --scenes then names cameras."
+
+
+def command(
+    full: Annotated[bool, typer.Option("--full", help=f"The study at {FULL_SIZE}.")] = False,
+    size: Annotated[
+        str | None, typer.Option("--size", metavar="WxH", help=f"Frame size; {SIZE} unless given.")
+    ] = None,
+    scenes: Annotated[str, typer.Option("--scenes", metavar="LIST", help="Scenes.")] = SCENES,
+    gpus: Annotated[str, typer.Option("--gpus", metavar="LIST", help="Presets or TOML files.")] = GPUS,
+    mesh: Annotated[Path | None, typer.Option("--mesh", metavar="FILE", help=MESH_HELP)] = None,
+    albedo_map: AlbedoMap = None,
+    normal_map: NormalMap = None,
+    frames: Annotated[
+        int, typer.Option("--frames", metavar="N", min=2, help="Frames of the adaptive run.")
+    ] = 16,
+    device: DeviceName = None,
+    output: Folder = Path("out"),
+) -> None:
+    """Compare fixed with adaptive sampling: demand and miss rates per scene and GPU, and pictures."""
+    from experiments.console import StageClock, progress, remark
+    from experiments.options import parse_image_size, scene_arguments
+    from experiments.output import input_file, output_folder
+    from traces.errors import InputError
+
+    clock = StageClock()
+    if full and size is not None:
+        raise InputError(f"--size {size}: --full has a size of its own, {FULL_SIZE}")
+    width, height = parse_image_size(size or (FULL_SIZE if full else SIZE))
+    scene_names = parse_names(scenes, "--scenes")
+    if mesh is not None:
+        input_file(mesh)
+    map_options = scene_arguments(str(mesh or scene_names[0]), None, albedo_map, normal_map)
+    from cachesim import presets
+
+    machines = [presets.load(name) for name in parse_names(gpus, "--gpus")]
+    with clock.stage("loading the libraries"):
+        from experiments import adaptive_vs_fixed as study
+        from kernels.device import open_device
+    folder = output_folder(output)
+    opened = open_device(device)
+    remark(
+        f"{width}x{height} on {opened.name}: about {estimate_s(width, height, len(scene_names)):,.0f} s "
+        "on two cores"
+    )
+    results: list[SceneResult] = []
+    with progress("starting", 1 + 5 * len(scene_names)) as bar:
+
+        def step(text: str) -> None:
+            bar.advance()
+            bar.describe(text)
+
+        for name in scene_names:
+            step(f"{name}: scene")
+            with clock.stage("scene"):
+                gbuffer = _load(name, mesh, width, height, opened, map_options)
+            results.append(
+                study.compare(
+                    name,
+                    gbuffer,
+                    machines,
+                    num_frames=frames,
+                    device=opened,
+                    clock=clock,
+                    step=step,
+                )
+            )
+    with clock.stage("tables and pictures"):
+        write_results(results, machines, frames, f"{width}x{height}", folder)
+    for line in clock.lines():
+        remark(line)
+
+
+def estimate_s(width: int, height: int, num_scenes: int) -> float:
+    """Seconds on two cores; the first run's compilation is in it."""
+    return 30 + width * height / 1e6 * num_scenes * SECONDS_PER_MEGAPIXEL * 0.7
+
+
+def _load(name, mesh, width, height, device, map_options):  # type: ignore[no-untyped-def]
+    from kernels.scene import load_scene
+
+    if mesh is None:
+        return load_scene(name, width, height, device=device)
+    return load_scene(str(mesh), width, height, camera=name, device=device, **map_options)
+
+
+def write_results(
+    results: list[SceneResult], machines: list[Gpu], num_frames: int, size: str, folder: Path
+) -> None:
+    """Print the tables; write them, the pictures, the sample-count maps and the plots."""
+    from experiments import adaptive_tables as tables
+    from experiments import adaptive_vs_fixed as study
+    from experiments import plots
+    from experiments.console import console, remark
+    from experiments.output import write_figure
+    from experiments.tables import print_table, write_table
+    from kernels.picture import preview, save_png, tone_map
+
+    demand = study.demand_frame(results)
+    ratios = study.ratio_frame(demand)
+    mips = study.mip_frame(results)
+    quality = study.quality_frame(results)
+    shown = {
+        "quality": (tables.quality_table(quality, f"Scenes at {size}", num_frames), quality),
+        "demand": (
+            tables.demand_table(demand, ratios, f"Fixed 64 against adaptive at {size}", size),
+            demand,
+        ),
+        "ratios": (None, ratios),
+        "mips": (tables.mip_table(mips, f"By mip at {size}"), mips),
+    }
+    for name, (table, data) in shown.items():
+        if table is not None:
+            print_table(table)
+            write_table(table, folder / name, data)
+    for result in results:
+        attribution = result.gbuffer.attribution
+        save_png(folder / f"{result.label}-unscattered.png", preview(result.gbuffer))
+        for method, frame in result.frames.items():
+            save_png(folder / f"{result.label}-{method}.png", tone_map(frame.combined))
+            title = f"{result.label}, {method}, frame {frame.index}"
+            figure = plots.count_map(frame.counts, title, attribution)
+            write_figure(folder / f"{result.label}-{method}-counts.png", figure)
+    megabytes = demand.assign(
+        **{name.replace("bytes", "mb"): demand[name] / 1e6 for name in tables.DEMAND_NAMES}
+    )
+    demand_labels = {
+        "l1_mb": "L1 demand (MB)",
+        "l2_mb": "L2 demand (MB)",
+        "dram_mb": "DRAM traffic (MB)",
+    }
+    rate_labels = {"l1_miss_rate": "L1 miss rate", "l2_miss_rate": "L2 miss rate"}
+    figures = {
+        "demand": plots.comparison_figure(megabytes, demand_labels, ",.0f"),
+        "miss-rates": plots.comparison_figure(demand, rate_labels, ".2f"),
+        "mips": plots.mip_figure(
+            tables.bar_frames(mips, machines[0].name), f"L1 demand on {machines[0].name} (MB)"
+        ),
+    }
+    for name, figure in figures.items():
+        write_figure(folder / f"{name}.png", figure)
+        write_figure(folder / f"{name}.pdf", figure)
+    for line in tables.scene_lines([r.gbuffer.attribution for r in results]):
+        console().print(line, markup=False)
+    remark(f"wrote tables, pictures and plots to {folder}")

@@ -1,7 +1,8 @@
-"""`cachesim layouts`: which texels share a sector and a line, per layout and format, as a table and pictures."""
+"""`cachesim layouts`: which texels share a sector and a line, as a table and as pictures."""
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Annotated
 
@@ -17,17 +18,23 @@ def command(
     """Print which texels share a sector and a line in each texel layout; with -o also draw it."""
     from experiments.console import progress, remark
     from experiments.output import output_folder, write_figure
-    from experiments.tables import plain_table, print_table, write_table
+    from experiments.tables import Column, Table, print_table, write_table
 
     folder = output_folder(output) if output is not None else None
     from traces.layout import LAYOUTS
     from traces.layout_picture import draw_layout, layout_table
     from traces.texture import FORMATS
 
-    table = plain_table(
-        "Texels that share a sector or a line (width x height)",
-        layout_table(),
-        ("The shape at the start of a large level; - where the texels are not a full rectangle.",),
+    frame = layout_table()
+    columns = [Column("layout", "layout"), Column("format", "format")]
+    for name in frame.columns[2:]:
+        size = re.search(r"\d+", name)
+        columns.append(Column(name, f"in {size[0]} B" if size else "texel bytes"))
+    table = Table(
+        "Texels that share 32 B (a sector) to 256 B (width x height)",
+        frame,
+        tuple(columns),
+        ('"32 of 16x4": not a full rectangle; the commonest piece is 32 texels out of 16x4.',),
     )
     print_table(table)
     if folder is None:

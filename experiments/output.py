@@ -1,4 +1,4 @@
-"""Where commands read and write: paths checked before the work starts, results written whole or not at all."""
+"""Where commands read and write: paths checked before the work, results written whole or not at all."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from traces.errors import InputError
-from traces.files import whole_file
+from traces.files import replacing, writing
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -15,14 +15,14 @@ if TYPE_CHECKING:
 
 def write_text(path: Path, text: str) -> None:
     """Write `text` as UTF-8, whole or not at all."""
-    with whole_file(path) as file:
-        file.write(text.encode())
+    with replacing(path) as part, writing(path):
+        part.write_text(text, encoding="utf-8")
 
 
 def write_figure(path: Path, figure: Figure, dpi: int = 150) -> None:
     """Write a figure in the format that the suffix names, whole or not at all."""
-    with whole_file(path) as file:
-        figure.savefig(file, dpi=dpi, format=path.suffix.removeprefix("."))
+    with replacing(path) as part, writing(path):
+        figure.savefig(part, dpi=dpi)
 
 
 def output_file(path: Path, *suffixes: str) -> Path:

@@ -1,12 +1,13 @@
 """Figures for a paper: fixed against adaptive, per mip, sample-count maps, sweeps.
 
-Colours are Okabe and Ito's, which people with colour-blindness tell apart; bars also differ in hatching. No pyplot: a figure
-belongs to whoever holds it.
+Colours are Okabe and Ito's, which people with colour-blindness tell apart; bars also differ in
+hatching, lines in marker and dash. No pyplot: a figure belongs to whoever holds it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -51,9 +52,12 @@ def count_map(counts: npt.NDArray[np.uint16], title: str, attribution: str = "")
     axes.set_title(title, fontsize=FONT_SIZE + 1)
     if attribution:
         axes.set_xlabel(attribution, fontsize=FONT_SIZE - 2)
-    bar = figure.colorbar(shown, ax=axes, shrink=0.9, ticks=edges[:-1])
-    bar.set_ticklabels([f"{low}-{high - 1}" for low, high in zip(edges, edges[1:], strict=False)])
-    bar.ax.tick_params(labelsize=FONT_SIZE - 1)
+    classes = list(pairwise(edges))
+    middles = [(low + high) / 2 for low, high in classes]
+    bar = figure.colorbar(shown, ax=axes, shrink=0.9, ticks=middles)
+    bar.set_ticklabels([f"{low}-{high - 1}" for low, high in classes])
+    bar.ax.tick_params(labelsize=FONT_SIZE - 1, length=0)
+    bar.ax.minorticks_off()
     bar.set_label("samples per pixel (grey: no scattering)", fontsize=FONT_SIZE)
     return figure
 
@@ -69,7 +73,7 @@ def _style(axes: Axes) -> None:
 def _paired_bars(
     axes: Axes, labels: Sequence[str], values: dict[str, Sequence[float]], digits: str = ""
 ) -> None:
-    """One group of bars per label, one bar per method; `digits` formats the number above each bar."""
+    """One group of bars per label, one bar per method; `digits` formats the number above a bar."""
     place = np.arange(len(labels))
     width = 0.8 / len(values)
     for i, (method, heights) in enumerate(values.items()):
@@ -90,10 +94,10 @@ def _paired_bars(
 
 
 def comparison_figure(frame: pd.DataFrame, quantities: dict[str, str], digits: str) -> Figure:
-    """Fixed beside adaptive: one row of axes per GPU, one column per quantity, one group of bars per scene.
+    """Fixed beside adaptive: axes in rows of GPUs and columns of quantities, bars grouped by scene.
 
-    frame: columns "scene", "gpu", "method" and the quantities. quantities: column to axis label with its unit.
-    digits: format of the numbers above the bars.
+    frame: columns "scene", "gpu", "method" and the quantities. quantities: column to axis label
+    with its unit. digits: format of the numbers above the bars.
     """
     gpus = list(dict.fromkeys(frame["gpu"]))
     scenes = list(dict.fromkeys(frame["scene"]))
@@ -119,7 +123,7 @@ def comparison_figure(frame: pd.DataFrame, quantities: dict[str, str], digits: s
 def mip_figure(frame: pd.DataFrame, label: str) -> Figure:
     """Bytes per mip level, fixed beside adaptive: one column of axes per scene.
 
-    frame: columns "scene", "method", "mip", "megabytes". label: of the vertical axis, with its unit.
+    frame: columns "scene", "method", "mip", "megabytes". label: of the vertical axis, with unit.
     """
     scenes = list(dict.fromkeys(frame["scene"]))
     mips = sorted(set(frame["mip"]))
@@ -139,7 +143,7 @@ def mip_figure(frame: pd.DataFrame, label: str) -> Figure:
 
 
 def sweep_figure(frame: pd.DataFrame, axes_fields: Sequence[str], title: str) -> Figure:
-    """Miss rate of each level, and DRAM traffic, over the first axis; one line per point of the other axes.
+    """Miss rate of each level, and DRAM traffic, over the first axis; a line per point of the rest.
 
     frame: as `cachesim.sweep` returns it. axes_fields: its axis columns.
     """
@@ -157,6 +161,7 @@ def sweep_figure(frame: pd.DataFrame, axes_fields: Sequence[str], title: str) ->
             "marker": "osD^vP"[index % 6],
             "markersize": 4,
             "linewidth": 1.2,
+            "linestyle": ("-", "--", "-.", ":")[index % 4],
             "label": label or None,
         }
         for axes, level in zip(panels, levels, strict=False):

@@ -1,4 +1,4 @@
-"""`cachesim presets`: the shipped GPUs, one GPU with the source of every field, or how two differ."""
+"""`cachesim presets`: the shipped GPUs, one with the source of every field, or how two differ."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ if TYPE_CHECKING:
 
 ACTIONS = {"list": 0, "show": 1, "diff": 2}
 CONFIDENCES = (
-    "S read in source code or a config, M measured on silicon, P published, R recalled from a vendor's "
-    "specification, D derived, ? assumed",
+    "S read in source code or a config, M measured on silicon, P published, R recalled from a "
+    "vendor's specification, D derived, ? assumed"
 )
 
 
@@ -36,10 +36,12 @@ def command(
         )
     if overrides and action != "show":
         raise InputError(f"--set {overrides[0]}: only `presets show` takes it, not {action}")
-    tables = {"list": list_table, "show": show_table, "diff": diff_table}
-    print_table(
-        show_table(given[0], overrides) if action == "show" else tables[action](*given)  # type: ignore[operator]
-    )
+    if action == "show":
+        print_table(show_table(given[0], overrides))
+    elif action == "diff":
+        print_table(diff_table(*given))
+    else:
+        print_table(list_table())
 
 
 def list_table() -> Table:
@@ -61,10 +63,8 @@ def list_table() -> Table:
                 if gpu.l1.units_per_sm > 1
                 else format_size(gpu.l1.capacity),
                 "gl1": format_size(gpu.gl1.capacity) if gpu.gl1 else None,
-                "l2": format_size(gpu.l2.capacity),
-                "slices": gpu.l2.num_slices,
+                "l2": f"{format_size(gpu.l2.capacity)} / {gpu.l2.num_slices}",
                 "llc": format_size(gpu.llc.capacity) if gpu.llc else None,
-                "line": f"{gpu.l1.line_bytes}/{gpu.l1.sector_bytes} B",
                 "layout": gpu.texture_layout,
             }
         )
@@ -73,10 +73,8 @@ def list_table() -> Table:
         Column("sms", "SMs"),
         Column("l1", "L1 of an SM"),
         Column("gl1", "GL1"),
-        Column("l2", "L2"),
-        Column("slices", "slices"),
+        Column("l2", "L2 / slices"),
         Column("llc", "LLC"),
-        Column("line", "L1 line/sector"),
         Column("layout", "texture layout"),
     )
     return Table("Presets", pd.DataFrame(rows), columns)
@@ -85,9 +83,15 @@ def list_table() -> Table:
 def show_table(name: str, overrides: list[str]) -> Table:
     """One row per field of a GPU: value, source, confidence."""
     from cachesim import presets
-    from experiments.tables import plain_table
+    from experiments.tables import Column, Table
 
-    return plain_table(name, presets.describe(name, overrides), CONFIDENCES)
+    columns = (
+        Column("field", "field"),
+        Column("value", "value"),
+        Column("confidence", "grade"),
+        Column("source", "source", wraps=True),
+    )
+    return Table(name, presets.describe(name, overrides), columns, (CONFIDENCES,))
 
 
 def diff_table(first: str, second: str) -> Table:

@@ -65,7 +65,7 @@ def print_report(report: Report) -> None:
     from experiments.tables import print_table
 
     print_table(level_table(report))
-    if report.by is not None:
+    if report.parts is not None:
         print_table(by_table(report))
     stages = ", ".join(f"{name} {seconds:.2f} s" for name, seconds in report.timings.items())
     remark(f"time per stage: {stages}")
@@ -87,10 +87,14 @@ def level_table(report: Report) -> Table:
         Column("writebacks", "write-backs"),
     )
     demand, dram = report.demand, report.dram
+    levels = ", ".join(
+        f"{name.upper()} {demand[f'{name}_bytes'] / 1e6:,.1f} MB" for name in (*report.levels, "dram")
+    )
     notes = (
-        f"Lane fetches {demand.lane_fetches:,}. Demand: L1 {demand.l1_bytes / 1e6:,.1f} MB, "
-        f"L2 {demand.l2_bytes / 1e6:,.1f} MB, DRAM {demand.dram_bytes / 1e6:,.1f} MB "
-        f"({dram.sectors_read:,} sectors read, {dram.sectors_written:,} written).",
+        f"{report.lane_fetches:,} lane fetches of {report.num_rows:,} warp instructions; fetch path "
+        f"{report.fetch_path}, layout {report.layout or 'none (byte addresses)'}.",
+        f"Demand: {levels} ({dram.sectors_read:,} sectors of {dram.sector_bytes} B read, "
+        f"{dram.sectors_written:,} written).",
         "Counts are in sectors of each level: "
         + ", ".join(f"{n} {report.counters[n].sector_bytes} B" for n in report.levels)
         + ".",
@@ -107,39 +111,37 @@ def by_table(report: Report) -> Table:
         Column("pass", "pass"),
         Column("texture", "texture"),
         Column("mip", "mip"),
-        Column("lane_fetches", "lane fetches"),
+        Column("lane_fetches_m", "fetches M", ",.2f"),
     ]
     for level in report.levels:
-        columns += [
-            Column(f"{level}_mb", f"{level.upper()} MB", ",.2f"),
-            Column(f"{level}_miss_rate", f"{level.upper()} miss", ".3f"),
-        ]
+        if level in ("l1", "l2"):
+            columns.append(Column(f"{level}_mb", f"{level.upper()} MB", ",.2f"))
+        columns.append(Column(f"{level}_miss_rate", f"{level.upper()} miss", ".3f"))
     columns.append(Column("dram_mb", "DRAM MB", ",.2f"))
     return Table("By pass, texture and mip", wide, tuple(columns))
 
 
 def by_wide(report: Report) -> pd.DataFrame:
-    """The report's `by` with one row per pass, texture and mip: lane fetches, MB and miss rate of each level, DRAM MB."""
+    """One row per pass, texture and mip: lane fetches (M), demand (MB) and miss rate of each level."""
     import pandas as pd
 
     rows = []
-    for part in report.by or ():
-        row = {name: part[name] for name in ("pass", "texture", "mip", "lane_fetches")}
-        for level in report.levels:
-            counts = part[level]
-            row[f"{level}_accesses"] = counts["accesses"]
-            row[f"{level}_misses"] = counts["misses"]
-            row[f"{level}_mb"] = counts["accesses"] * report.counters[level].sector_bytes / 1e6
-            row[f"{level}_miss_rate"] = miss_rate(counts["misses"], counts["accesses"])
-        row["dram_mb"] = part["dram"]["bytes"] / 1e6
+    for part in report.parts or ():
+        row: dict[str, object] = {
+            "pass": part.pass_name,
+            "texture": part.texture,
+            "mip": part.mip,
+            "lane_fetches_m": part.lane_fetches / 1e6,
+        }
+        for level, counts in part.counters.items():
+            row[f"{level}_mb"] = counts.presented * counts.sector_bytes / 1e6
+            row[f"{level}_miss_rate"] = counts.miss_rate
+        row["dram_mb"] = part.dram.bytes / 1e6
         rows.append(row)
-    return pd.DataFrame(rows)
-
-
-def miss_rate(misses: int, accesses: int) -> float | None:
-    """Misses / accesses; None where there were none."""
-    return misses / accesses if accesses else None
+    frame = pd.DataFrame(rows)
+    rates = {f"{level}_miss_rate": float for level in report.levels}
+    return frame.astype(rates) if rows else frame
 
 
 def _by_frame(report: Report) -> pd.DataFrame:
-    return report.frame() if report.by is None else report.by_frame()
+    return report.frame() if report.parts is None else report.by_frame()

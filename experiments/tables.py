@@ -1,4 +1,4 @@
-"""Tables for people and for papers: a DataFrame printed on the console and written as CSV, Markdown and LaTeX."""
+"""Tables for people and papers: a DataFrame printed, and written as CSV, Markdown and LaTeX."""
 
 from __future__ import annotations
 
@@ -37,20 +37,24 @@ _LATEX = str.maketrans(
 class Column:
     """How a column of a frame is shown.
 
-    name: of the frame's column, as the CSV has it. heading: what people read. format: a format specification for numbers,
-    such as ",.1f"; an integer needs none.
+    name: of the frame's column. heading: what people read. format: a format specification for
+    numbers, such as ",.1f"; an integer needs none. numeric: whether it stands to the right; None
+    asks the column's type. wraps: whether long text may take several lines on the console.
     """
 
     name: str
     heading: str
     format: str = ""
+    numeric: bool | None = None
+    wraps: bool = False
 
 
 @dataclass(frozen=True, eq=False)
 class Table:
     """A frame with what a reader needs beside it.
 
-    columns: which columns are shown, in this order; the CSV has all of the frame's. notes: sentences under the table.
+    columns: which columns are shown, in this order; the CSV has all of the frame's. notes:
+    sentences under the table.
     """
 
     title: str
@@ -65,7 +69,7 @@ def plain_table(title: str, frame: pd.DataFrame, notes: Sequence[str] = ()) -> T
 
 
 def show_value(value: Any, specification: str = "") -> str:
-    """One cell: "-" for None and NaN, thousands separated in integers, `specification` for other numbers."""
+    """One cell: "-" for None and NaN, "1,234" for integers, `specification` for other numbers."""
     if value is None or (isinstance(value, float) and math.isnan(value)):
         return MISSING
     if isinstance(value, str | bool):
@@ -90,6 +94,8 @@ def _scalar(value: Any) -> Any:
 def _is_number(table: Table, column: Column) -> bool:
     from pandas.api.types import is_numeric_dtype
 
+    if column.numeric is not None:
+        return column.numeric
     return bool(is_numeric_dtype(table.frame[column.name]))
 
 
@@ -99,17 +105,29 @@ def print_table(table: Table) -> None:
     from rich.table import Table as RichTable
 
     out = console()
+    shown = cells(table)
     made = RichTable(
-        title=table.title, title_justify="left", title_style="bold", box=SIMPLE_HEAD, padding=(0, 1)
+        title=table.title,
+        title_justify="left",
+        title_style="bold",
+        box=SIMPLE_HEAD,
+        padding=(0, 1),
+        collapse_padding=True,
+        pad_edge=False,
     )
-    made.pad_edge = False
-    for column in table.columns:
-        made.add_column(column.heading, justify="right" if _is_number(table, column) else "left")
+    for i, column in enumerate(table.columns):
+        # Headings and long text may wrap; a number in two lines would be two numbers.
+        longest = max((len(row[i]) for row in shown), default=0)
+        made.add_column(
+            column.heading,
+            justify="right" if _is_number(table, column) else "left",
+            min_width=None if column.wraps else longest,
+        )
     num_words = next(
         (i for i, c in enumerate(table.columns) if _is_number(table, c)), len(table.columns)
     )
     previous: list[str] = []
-    for row in cells(table):
+    for row in shown:
         made.add_row(*_blank_repeats(row, previous, num_words - 1))
         previous = row
     out.print(made)
@@ -120,7 +138,7 @@ def print_table(table: Table) -> None:
 
 
 def _blank_repeats(row: list[str], previous: list[str], num_columns: int) -> list[str]:
-    """`row` with its leading cells emptied as long as they repeat `previous`, in the first `num_columns` columns."""
+    """`row` with those of its first `num_columns` cells emptied that repeat `previous`."""
     shown = list(row)
     for i in range(num_columns):
         if not previous or row[i] != previous[i]:
@@ -150,7 +168,7 @@ def markdown(table: Table) -> str:
 
 
 def latex(table: Table) -> str:
-    """A `table` environment that needs no package: rules are `\\hline`, notes stand under the tabular."""
+    """A `table` environment that needs no package, with the notes under the tabular."""
     numeric = "".join("r" if _is_number(table, c) else "l" for c in table.columns)
     heads = " & ".join(c.heading.translate(_LATEX) for c in table.columns)
     body = [" & ".join(c.translate(_LATEX) for c in row) + r" \\" for row in cells(table)]
@@ -177,9 +195,12 @@ def csv(frame: pd.DataFrame) -> str:
     return text
 
 
-def write_table(table: Table, stem: Path) -> list[Path]:
-    """Write `stem`.csv, .md and .tex; returns their paths."""
-    texts = {".csv": csv(table.frame), ".md": markdown(table), ".tex": latex(table)}
+def write_table(table: Table, stem: Path, data: pd.DataFrame | None = None) -> list[Path]:
+    """Write `stem`.csv, .md and .tex; returns their paths.
+
+    data: what the CSV holds where it is not the shown frame.
+    """
+    texts = {".csv": csv(table.frame if data is None else data), ".md": markdown(table), ".tex": latex(table)}
     paths = [stem.with_name(stem.name + suffix) for suffix in texts]
     for path, text in zip(paths, texts.values(), strict=True):
         write_text(path, text)

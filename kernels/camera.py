@@ -60,10 +60,10 @@ class Camera:
 CAMERAS: dict[str, Camera] = {
     camera.name: camera
     for camera in (
-        Camera("close", (-5.5, -5.2, 26.0), (-1.4, -4.3, 8.6), coverage_rate=1.0, pixels_per_mm=18.0),
-        Camera("ear", (24.0, -0.5, -14.5), (6.9, -1.9, -2.2), coverage_rate=0.9, pixels_per_mm=18.0),
+        Camera("close", (-7.5, -5.0, 24.0), (-2.2, -4.0, 8.4), coverage_rate=1.0, pixels_per_mm=18.0),
+        Camera("ear", (27.0, 1.0, 4.0), (6.8, -1.7, -1.1), coverage_rate=0.9, pixels_per_mm=18.0),
         Camera("front", (0.0, -2.0, 140.0), (0.0, -3.5, 0.0), coverage_rate=0.13, pixels_per_mm=2.7),
-        Camera("side", (90.0, -2.0, 0.0), (0.0, -3.0, 0.0), coverage_rate=0.3, pixels_per_mm=4.2),
+        Camera("side", (104.0, -2.0, 1.0), (0.0, -2.0, 0.0), coverage_rate=0.3, pixels_per_mm=4.2),
     )
 }
 

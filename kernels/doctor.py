@@ -32,6 +32,7 @@ from kernels.icd import driver_libraries, user_vendors
 
 #: A CPU device for any x86-64 Linux; the `intel` extra of this project.
 INTEL_WHEELS = ("intel-opencl-rt", "intel-cmplr-lib-rt")
+INTEL_SIZE = "280 MB to download, 800 MB on disk"
 _ROOT = Path(__file__).resolve().parents[1]
 _PROBE_TIMEOUT_S = 120
 
@@ -89,7 +90,7 @@ def install_fallback(progress: Callable[[str], None]) -> Diagnosis:
         raise DeviceError(
             f"OCL_ICD_VENDORS={diagnosis.vendors} hides what would be installed: unset it first"
         )
-    progress("No OpenCL device works: installing Intel's CPU runtime (225 MB, 800 MB on disk)")
+    progress(f"No OpenCL device works: installing Intel's CPU runtime ({INTEL_SIZE})")
     _pip_install(INTEL_WHEELS, progress)
     diagnosis = diagnose()
     if not any(probe.works for probe in diagnosis.probes):
@@ -133,7 +134,7 @@ def _advice(any_works: bool, named_works: bool) -> tuple[str, ...]:
         )
     return (
         "No OpenCL device works. Either of these gives a CPU device:",
-        "  without root, on x86-64: cachesim doctor --install  (225 MB, 800 MB on disk)",
+        f"  without root, on x86-64: cachesim doctor --install  ({INTEL_SIZE})",
         "  with root, on Debian or Ubuntu: apt install pocl-opencl-icd",
     )
 

@@ -2,7 +2,7 @@
 // tile's rays; `head_render` goes on from there for every pixel.
 
 #define TILE 8
-#define MAX_STEPS 80
+#define MAX_STEPS 192
 #define MAX_SHADOW_STEPS 56
 #define FAR_CM 1.0e6f
 
@@ -11,7 +11,7 @@
 #define BOUND_RADIUS 27.0f
 
 // Entry and exit of a ray through the bounding sphere; exit < entry where it misses. direction need not be a unit.
-static float2 head_bounds(float3 origin, float3 direction, float widen)
+HEAD_INLINE float2 head_bounds(float3 origin, float3 direction, float widen)
 {
     float3 o = origin - BOUND_CENTRE;
     float a = head_dot(direction, direction);
@@ -21,24 +21,24 @@ static float2 head_bounds(float3 origin, float3 direction, float widen)
     float discriminant = b * b - a * c;
     if (discriminant <= 0.0f)
         return (float2)(0.0f, -1.0f);
-    float root = sqrt(discriminant);
-    return (float2)(fmax((-b - root) / a, 0.0f), (-b + root) / a);
+    float root = head_root(discriminant);
+    return (float2)(fmax(head_over(-b - root, a), 0.0f), head_over(-b + root, a));
 }
 
-static float3 head_direction(float4 right, float4 up, float4 forward, float x, float y)
+HEAD_INLINE float3 head_direction(float4 right, float4 up, float4 forward, float x, float y)
 {
     // .w of right and up: size of a pixel at unit distance; .w of forward is not used. x, y: pixels from the centre
     return forward.xyz + right.xyz * (x * right.w) + up.xyz * (y * up.w);
 }
 
 __kernel void head_start(float4 origin, float4 right, float4 up, float4 forward, int width, int height, int first_row,
-                         int tiles_x, __global float* restrict start)
+                         int tiles_x, __global const float* restrict grid, __global float* restrict start)
 {
     int tile_x = get_global_id(0), tile_y = get_global_id(1);
     float x = (float)(tile_x * TILE) + 0.5f * TILE - 0.5f * (float)width;
     float y = 0.5f * (float)height - ((float)(first_row + tile_y * TILE) + 0.5f * TILE);
     float3 direction = head_direction(right, up, forward, x, y);
-    float length = head_length(direction);
+    float inverse = head_over(1.0f, head_length(direction));
     // Radius of the cone around the tile at unit depth: half its diagonal, a little more for safety
     float spread = 0.75f * TILE * right.w;
     float2 range = head_bounds(origin.xyz, direction, 1.0f);
@@ -46,10 +46,10 @@ __kernel void head_start(float4 origin, float4 right, float4 up, float4 forward,
     float result = range.y < range.x ? FAR_CM : t;
     if (range.y >= range.x) {
         for (int step = 0; step < MAX_STEPS; ++step) {
-            float free = head_distance(origin.xyz + direction * t) - spread * t;
+            float free = head_far(grid, origin.xyz + direction * t) - spread * t;
             if (free < 0.02f)
                 break;
-            t += free * 0.85f / length;
+            t += free * 0.85f * inverse;
             if (t > range.y)
                 break;
         }
@@ -58,7 +58,7 @@ __kernel void head_start(float4 origin, float4 right, float4 up, float4 forward,
     start[tile_y * tiles_x + tile_x] = result;
 }
 
-static float3 head_normal(float3 p, float h)
+HEAD_INLINE float3 head_normal(float3 p, float h)
 {
     const float3 a = (float3)(1.0f, -1.0f, -1.0f), b = (float3)(-1.0f, -1.0f, 1.0f);
     const float3 c = (float3)(-1.0f, 1.0f, -1.0f), d = (float3)(1.0f, 1.0f, 1.0f);
@@ -68,37 +68,38 @@ static float3 head_normal(float3 p, float h)
 
 // Share of a disc light of angular radius atan(radius) that is seen from p: the closest that the ray to its centre
 // comes to the surface, in units of the disc's cone there, from -1 (all hidden) to 1 (all seen).
-static float head_shadow(float3 p, float3 to_light, float radius)
+HEAD_INLINE float head_shadow(__global const float* restrict grid, float3 p, float3 to_light, float radius)
 {
     float closest = 1.0f;
     float t = 0.06f;
     for (int step = 0; step < MAX_SHADOW_STEPS; ++step) {
-        float d = head_distance(p + to_light * t);
-        closest = fmin(closest, d / (t * radius));
+        float d = head_far(grid, p + to_light * t);
+        closest = fmin(closest, head_over(d, t * radius));
         if (closest < -1.0f || t > 26.0f)
             break;
-        t += fmin(fmax(fabs(d) * 0.8f, 0.03f + 0.03f * t), 3.0f);
+        t += fmin(fmax(fabs(d) * 0.9f, 0.03f + 0.03f * t), 6.0f);
     }
     closest = fmax(closest, -1.0f);
     return 0.25f * (1.0f + closest) * (1.0f + closest) * (2.0f - closest);
 }
 
 // Ambient occlusion from the field's value at a few heights above the surface.
-static float head_occlusion(float3 p, float3 n)
+HEAD_INLINE float head_occlusion(__global const float* restrict grid, float3 p, float3 n)
 {
     float hidden = 0.0f;
     float weight = 1.0f;
     float height = 0.12f;
     for (int tap = 0; tap < 5; ++tap) {
-        hidden += fmax(height - head_distance(p + n * height), 0.0f) * weight / height;
+        hidden += fmax(height - head_far(grid, p + n * height), 0.0f) * head_over(weight, height);
         weight *= 0.85f;
         height *= 2.0f;
     }
-    return head_saturate(1.0f - 0.42f * hidden);
+    return fmax(1.0f - 0.36f * hidden, 0.12f);
 }
 
 __kernel void head_render(float4 origin, float4 right, float4 up, float4 forward, int width, int height, int first_row,
-                          int tiles_x, __global const float* restrict start, int num_lights,
+                          int tiles_x, __global const float* restrict grid,
+                          __global const float* restrict start, int num_lights,
                           __global const float* restrict lights, float4 ambient, float4 background,
                           __global float* restrict irradiance, __global float* restrict albedo,
                           __global float* restrict non_subsurface, __global float* restrict depth,
@@ -108,8 +109,8 @@ __kernel void head_render(float4 origin, float4 right, float4 up, float4 forward
     size_t pixel = (size_t)row * width + column;
     float3 direction = head_direction(right, up, forward, (float)column + 0.5f - 0.5f * (float)width,
                                       0.5f * (float)height - ((float)(first_row + row) + 0.5f));
-    float length = head_length(direction);
-    float3 unit = direction * (1.0f / length);
+    float inverse = head_over(1.0f, head_length(direction));
+    float3 unit = direction * inverse;
     float2 range = head_bounds(origin.xyz, direction, 1.0f);
     float t = start[(row / TILE) * tiles_x + column / TILE];
 
@@ -117,8 +118,8 @@ __kernel void head_render(float4 origin, float4 right, float4 up, float4 forward
     bool hit = false;
     if (t < FAR_CM && range.y >= range.x) {
         for (int step = 0; step < MAX_STEPS; ++step) {
-            float d = head_distance(origin.xyz + direction * t);
-            t += d * 0.85f / length;
+            float d = head_far(grid, origin.xyz + direction * t);
+            t += d * 0.85f * inverse;
             if (d < 0.5f * right.w * t) {
                 hit = true;
                 break;
@@ -138,7 +139,7 @@ __kernel void head_render(float4 origin, float4 right, float4 up, float4 forward
     }
 
     // What is there: eyes and shirt end where the skin begins
-    t += head_distance(origin.xyz + direction * t) / length;
+    t += head_distance(origin.xyz + direction * t) * inverse;
     float3 p = origin.xyz + direction * t;
     float footprint = right.w * t;
     float3 smooth = head_normal(p, fmax(0.5f * footprint, 0.004f));
@@ -153,7 +154,7 @@ __kernel void head_render(float4 origin, float4 right, float4 up, float4 forward
     float3 n = head_unit(smooth - (s.relief - smooth * head_dot(s.relief, smooth)));
 
     // Light it: diffuse irradiance apart from the mirrored part
-    float occlusion = head_occlusion(p, smooth);
+    float occlusion = head_occlusion(grid, p, smooth);
     float3 diffuse = ambient.xyz * (occlusion * (0.75f + 0.25f * n.y));
     float grazing = 1.0f - head_saturate(-head_dot(n, unit));
     float fresnel = grazing * grazing * grazing * grazing * grazing;
@@ -167,7 +168,7 @@ __kernel void head_render(float4 origin, float4 right, float4 up, float4 forward
         float wrap = head_dot(smooth, to_light);
         if (facing <= 0.0f || wrap <= -0.1f)
             continue;
-        float seen = light[7] > 0.0f ? head_shadow(lifted, to_light, light[3]) : occlusion;
+        float seen = light[7] > 0.0f ? head_shadow(grid, lifted, to_light, light[3]) : occlusion;
         diffuse += power * (facing * seen);
         // GGX lobe with Kelemen's visibility term, widened by the size of the light
         float3 half_way = head_unit(to_light - unit);
@@ -178,7 +179,7 @@ __kernel void head_render(float4 origin, float4 right, float4 up, float4 forward
         float spread = nh * nh * (a2 - 1.0f) + 1.0f;
         float away = 1.0f - lh;
         float schlick = s.reflectance + (1.0f - s.reflectance) * away * away * away * away * away;
-        mirrored += power * (facing * seen * schlick * a2 / (4.0f * lh * lh * spread * spread));
+        mirrored += power * (facing * seen * schlick * head_over(a2, 4.0f * lh * lh * spread * spread));
     }
 
     float skin_pixel = s.profile != 0 ? 1.0f : 0.0f;

@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
 SOURCE_FILES = ("head_shape.cl", "head_skin.cl", "head.cl")
 TILE = 8
+# Nodes of the distance grid, as in head_shape.cl.
+GRID = (54, 168, 132)
 # Pixels in flight on the device at once: 53 bytes each, so 14 MB whatever the size of the picture.
 BAND_PIXELS = 1 << 18
 # Plane of the G-buffer: channels. In the order of the kernel's arguments.
@@ -53,7 +55,7 @@ def render_head(
     device = device or open_device()
     import pyopencl as cl  # after the drivers are set up
 
-    start_kernel, render_kernel = _kernels(device)
+    start_kernel, render_kernel, grid = _kernels(device)
     view = _view(camera, width)
     lights = rig.as_array()
     flags = cl.mem_flags
@@ -80,7 +82,7 @@ def render_head(
 
     for first_row in range(0, height, band_rows):
         rows = min(band_rows, height - first_row)
-        geometry = (*view, np.int32(width), np.int32(height), np.int32(first_row), np.int32(tiles_x))
+        geometry = (*view, np.int32(width), np.int32(height), np.int32(first_row), np.int32(tiles_x), grid)
         start_kernel(device.queue, (tiles_x, -(-rows // TILE)), None, *geometry, start)
         render_kernel(
             device.queue,
@@ -106,11 +108,15 @@ def render_head(
 
 
 @cache
-def _kernels(device: Device) -> tuple[cl.Kernel, cl.Kernel]:
+def _kernels(device: Device) -> tuple[cl.Kernel, cl.Kernel, cl.Buffer]:
+    """The kernels and the distance grid, which depends on nothing but the shape: once per device."""
     import pyopencl as cl
 
-    program = device.build(source())
-    return cl.Kernel(program, "head_start"), cl.Kernel(program, "head_render")
+    exact = device.correctly_rounded or "cl_khr_fp64" not in device.context.devices[0].extensions
+    program = device.build(source(), [] if exact else ["-D HEAD_DOUBLE"])
+    grid = cl.Buffer(device.context, cl.mem_flags.READ_WRITE, 4 * GRID[0] * GRID[1] * GRID[2])
+    cl.Kernel(program, "head_grid")(device.queue, GRID, None, grid)
+    return cl.Kernel(program, "head_start"), cl.Kernel(program, "head_render"), grid
 
 
 def _view(camera: Camera, width: int) -> list[np.ndarray]:

@@ -8,17 +8,17 @@ typedef struct {
     uchar profile;    // 1 = skin, 0 = does not scatter
 } HeadSurface;
 
-static uint head_hash(int x, int y, int z)
+HEAD_INLINE uint head_hash(int x, int y, int z)
 {
     uint h = (uint)x * 0x8da6b343u ^ (uint)y * 0xd8163841u ^ (uint)z * 0xcb1ab31fu;
     h = (h ^ (h >> 16)) * 0x7feb352du;
     h = (h ^ (h >> 15)) * 0x846ca68bu;
     return h ^ (h >> 16);
 }
-static float head_random(int x, int y, int z) { return (float)(head_hash(x, y, z) >> 8) * 5.9604645e-8f; }
+HEAD_INLINE float head_random(int x, int y, int z) { return (float)(head_hash(x, y, z) >> 8) * 5.9604645e-8f; }
 
 // Value noise in [0, 1] and its gradient.
-static float head_noise(float3 p, float3* gradient)
+HEAD_INLINE float head_noise(float3 p, float3* gradient)
 {
     float3 cell = (float3)(floor(p.x), floor(p.y), floor(p.z));
     float3 f = p - cell;
@@ -37,14 +37,14 @@ static float head_noise(float3 p, float3* gradient)
     *gradient = du * (float3)(slope_x, slope_y, far - near);
     return head_lerp(near, far, u.z);
 }
-static float head_tone(float3 p)
+HEAD_INLINE float head_tone(float3 p)
 {
     float3 unused;
     return head_noise(p, &unused);
 }
 
 // Pores: a dimple at a jittered point of every cell. Returns the depth in [0, 1] and adds its gradient.
-static float head_pores(float3 p, float3* gradient)
+HEAD_INLINE float head_pores(float3 p, float3* gradient)
 {
     float3 base = (float3)(floor(p.x - 0.5f), floor(p.y - 0.5f), floor(p.z - 0.5f));
     float nearest = 1.0f;
@@ -66,21 +66,21 @@ static float head_pores(float3 p, float3* gradient)
 }
 
 // How much of a detail of the given size (cm) survives where a pixel covers `footprint` cm: none below two pixels.
-static float head_visible(float size, float footprint) { return head_saturate(size / (3.0f * footprint) - 0.6f); }
+HEAD_INLINE float head_visible(float size, float footprint) { return head_saturate(head_over(size, 3.0f * footprint) - 0.6f); }
 
-static float head_brow_mask(float3 q, float3 p)
+HEAD_INLINE float head_brow_mask(float3 q, float3 p)
 {
     float x = q.x;
     float arch = 1.72f + 0.30f * head_step(0.9f, 3.9f, x) - 0.75f * head_step(3.6f, 5.6f, x);
     float half_height = 0.42f - 0.30f * head_step(2.0f, 5.2f, x);
-    float inside = 1.0f - head_step(0.45f, 1.15f, fabs(q.y - arch) / half_height);
+    float inside = 1.0f - head_step(0.45f, 1.15f, head_over(fabs(q.y - arch), half_height));
     inside = inside * head_step(0.75f, 1.3f, x) * (1.0f - head_step(4.6f, 5.3f, x)) * head_step(4.0f, 5.0f, q.z);
     // Hairs lean outwards and up
     float hair = head_tone((float3)((p.x > 0.0f ? x - q.y : x - q.y) * 9.0f, (q.y + 0.35f * x) * 3.0f, p.x > 0.0f ? 3.5f : 9.5f));
     return head_saturate(inside * (0.45f + 0.9f * hair));
 }
 
-static float head_lip_mask(float3 q)
+HEAD_INLINE float head_lip_mask(float3 q)
 {
     float3 m = head_mouth_space(q);
     float bow = 0.10f * head_step(0.0f, 0.55f, m.x) - 0.12f * head_step(0.5f, 2.4f, m.x);
@@ -92,7 +92,7 @@ static float head_lip_mask(float3 q)
 }
 
 // Share of the scalp's cropped hair: above the hairline, behind the temples, around the ears.
-static float head_hair_mask(float3 q, float3 p)
+HEAD_INLINE float head_hair_mask(float3 q, float3 p)
 {
     float ragged = 0.7f * (head_tone(p * 1.1f) - 0.5f) + 0.25f * (head_tone(p * 7.0f) - 0.5f);
     float front = q.y - 7.2f + 0.10f * q.x * q.x * head_saturate(1.0f - 0.13f * q.x) + 0.0f;
@@ -105,7 +105,7 @@ static float head_hair_mask(float3 q, float3 p)
     return head_step(-0.5f, 0.7f, edge) * head_step(0.95f, 1.25f, ear);
 }
 
-static HeadSurface head_skin_surface(float3 p, float3 n, float footprint)
+HEAD_INLINE HeadSurface head_skin_surface(float3 p, float3 n, float footprint)
 {
     float3 q = head_mirrored(p);
     HeadSurface s;
@@ -201,7 +201,7 @@ static HeadSurface head_skin_surface(float3 p, float3 n, float footprint)
     return s;
 }
 
-static HeadSurface head_eye_surface(float3 p)
+HEAD_INLINE HeadSurface head_eye_surface(float3 p)
 {
     float3 e = head_mirrored(p) - EYE_CENTRE;
     float r = head_length2(e.x, e.y);
@@ -214,7 +214,7 @@ static HeadSurface head_eye_surface(float3 p)
     float vessel = head_step(0.62f, 0.75f, head_tone((float3)(p.x * 5.0f, p.y * 13.0f, p.z * 3.0f)));
     float3 white = head_lerp3((float3)(0.46f, 0.42f, 0.40f), (float3)(0.42f, 0.24f, 0.20f), 0.25f * vessel + 0.45f * head_step(0.8f, 1.3f, r));
     // Iris: fibres run from the pupil to the limbus
-    float inverse = 1.0f / (r + 1e-4f);
+    float inverse = head_over(1.0f, r + 1e-4f);
     float fibre = head_tone((float3)(e.x * inverse * 9.0f, e.y * inverse * 9.0f, r * 3.0f + (p.x > 0.0f ? 0.0f : 5.0f)));
     float3 iris = head_lerp3((float3)(0.055f, 0.085f, 0.095f), (float3)(0.20f, 0.25f, 0.24f), fibre);
     iris = head_lerp3((float3)(0.20f, 0.13f, 0.06f), iris, head_step(0.22f, 0.40f, r));
@@ -227,7 +227,7 @@ static HeadSurface head_eye_surface(float3 p)
     return s;
 }
 
-static HeadSurface head_shirt_surface(float3 p, float footprint)
+HEAD_INLINE HeadSurface head_shirt_surface(float3 p, float footprint)
 {
     HeadSurface s;
     s.profile = 0;

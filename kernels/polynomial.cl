@@ -78,7 +78,9 @@ float2 poly_cos_sin(uint turn)
     c = 1.0f / 24.0f + z * c;
     c = z * c - 0.5f;
     c = 1.0f + z * c;
-    const float cosine = (quadrant & 1u) ? s : c;
-    const float sine = (quadrant & 1u) ? c : s;
-    return (float2)(((quadrant + 1u) & 2u) ? -cosine : cosine, (quadrant & 2u) ? -sine : sine);
+    // Swap in odd quadrants, flip signs: on bits, as a branch would be mispredicted half the time.
+    const uint swap = (as_uint(s) ^ as_uint(c)) & (0u - (quadrant & 1u));
+    const uint cosine = (as_uint(c) ^ swap) ^ (((quadrant + 1u) & 2u) << 30);
+    const uint sine = (as_uint(s) ^ swap) ^ ((quadrant & 2u) << 30);
+    return (float2)(as_float(cosine), as_float(sine));
 }

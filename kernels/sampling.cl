@@ -24,11 +24,17 @@ uint pcg3d16(uint x, uint y, uint z)
     return x >> 16;
 }
 
-// e^max(x, -28), and its cube: the two exponentials of Burley's profile at x = -r / (3 d).
-float2 profile_exponentials(float x)
+// e^max(x, -28) and its cube, weighted: w_wide e^x + w_narrow e^3x. With x = -r / (3 d) and weights 1 it is Burley's profile.
+float burley(float x, float w_wide, float w_narrow)
 {
     const float wide = poly_exp(x < EXPONENT_MIN ? EXPONENT_MIN : x);
-    return (float2)(wide, wide * wide * wide);
+    return w_narrow * (wide * wide * wide) + w_wide * wide;
+}
+
+// A non-negative half float from the low 16 bits; no denormals.
+float decode_half(uint bits)
+{
+    return as_float((bits & 0xffffu) << 13) * 0x1p112f;
 }
 
 // Radius over d for xi_1, given its complement 1 - xi_1 in (0, 1].
@@ -54,19 +60,25 @@ float half_cosine(uint n, uint m)
     return result < 0.0f ? 0.0f : (result > 1.0f ? 1.0f : result);
 }
 
-// ratio: (texels of level l over texels of level 0) of x at 2 l and of y at 2 l + 1.
+// Scalars only, no vector types: compilers for CPUs then put 8 or 16 lanes into one vector by themselves.
+// setup_texture: half-float texels as two words, red | green << 16 and blue | depth << 16. ratio: of level l, its width (2 l) and
+// height (2 l + 1) over level 0's. _r, _g, _b, _s: red, green, blue and the sampled channel.
 PASS_KERNEL sampling(
-    WARP_ARGS, __global const ushort *setup_texture, __global const uint *normal, __global const uchar *profile_id,
+    WARP_ARGS, __global const uint *setup_texture, __global const uint *normal, __global const uchar *profile_id,
     __global const ushort *counts, __global const float2 *velocity, __global half *scattered, const int has_velocity,
     const int fixed_count, const uint frame, const int num_levels, __global const float *ratio, const float texels_per_mm_at_cm,
-    const float d, const float4 rate, const float4 density, const float mip_scale TRACE_ARGS)
+    const float d, const float rate_r, const float rate_g, const float rate_b, const float rate_s, const float density_r,
+    const float density_g, const float density_b, const float density_s, const float mip_scale TRACE_ARGS)
 {
     FIND_PIXEL
     FIND_ROW
     const uint pixel = inside ? (uint)(y * width + x) : 0u;
-    const float4 centre =
-        inside ? load_setup(setup_texture, setup_index(0, y, x, width, height)) : (float4)(0.0f);
-    const bool scatters = centre.w > 0.0f;
+    const uint own = inside ? 2u * setup_index(0, y, x, width, height) : 0u;
+    const float centre_r = decode_half(setup_texture[own]);
+    const float centre_g = decode_half(setup_texture[own] >> 16);
+    const float centre_b = decode_half(setup_texture[own + 1u]);
+    const float centre_depth = decode_half(setup_texture[own + 1u] >> 16);
+    const bool scatters = inside && centre_depth > 0.0f;
     TRACE(TRACE_COLOUR, inside, 0, y, x)
 
     float4 result = (float4)(0.0f);
@@ -85,24 +97,19 @@ PASS_KERNEL sampling(
 #endif
 
         // Project: texels per mm at this depth, and the mip rule's factor that does not change with the sample.
-        const float depth = scatters ? centre.w : 1.0f;
-        const float texels_per_mm = texels_per_mm_at_cm / depth;
-        const float texels_per_mm_sq = texels_per_mm * texels_per_mm;
-        const float mip_factor = mip_scale * (float)count / texels_per_mm_sq;
+        const float texels_per_mm = texels_per_mm_at_cm / (scatters ? centre_depth : 1.0f);
+        const float mip_factor = mip_scale * (float)count / (texels_per_mm * texels_per_mm);
 
-        // Centre reweighting: share of each profile within one texel; samples start beyond the sampled channel's.
+        // Centre reweighting: the share of each profile beyond one texel; samples start beyond the sampled channel's.
         const float radius_centre = 1.0f / texels_per_mm;
-        const float2 inner_r = profile_exponentials(radius_centre * rate.x);
-        const float2 inner_g = profile_exponentials(radius_centre * rate.y);
-        const float2 inner_b = profile_exponentials(radius_centre * rate.z);
-        const float2 inner_s = profile_exponentials(radius_centre * rate.w);
-        const float4 outer_share =
-            0.25f * (float4)(inner_r.y, inner_g.y, inner_b.y, inner_s.y) +
-            0.75f * (float4)(inner_r.x, inner_g.x, inner_b.x, inner_s.x);
+        const float beyond_r = burley(radius_centre * rate_r, 0.75f, 0.25f);
+        const float beyond_g = burley(radius_centre * rate_g, 0.75f, 0.25f);
+        const float beyond_b = burley(radius_centre * rate_b, 0.75f, 0.25f);
+        const float beyond_s = burley(radius_centre * rate_s, 0.75f, 0.25f);
 #if CENTRE_REWEIGHTING
-        const float complement_max = outer_share.w;
+        const float unit = 0x1p-24f * beyond_s;
 #else
-        const float complement_max = 1.0f;
+        const float unit = 0x1p-24f;
 #endif
 
         const float middle_x = (float)x + 0.5f;
@@ -123,12 +130,11 @@ PASS_KERNEL sampling(
 
             // Sample a radius and a direction.
             const uint index = start + (uint)i;
-            const float complement = (float)(int)(0x1000000u - ((index * R2_X) >> 8)) * 0x1p-24f * complement_max;
+            const float complement = (float)(int)(0x1000000u - ((index * R2_X) >> 8)) * unit;
             const float2 direction = poly_cos_sin(index * R2_Y);
             float r = d * invert_cdf(complement);
             r = r < RADIUS_MIN ? RADIUS_MIN : r;
-            const float2 sampled = profile_exponentials(r * rate.w);
-            float p = (sampled.y + sampled.x) * density.w;
+            float p = burley(r * rate_s, 1.0f, 1.0f) * density_s;
             p = p < PDF_MIN ? PDF_MIN : p;
 
             // Find the texel; coordinates are clamped to the viewport's texel centres.
@@ -144,25 +150,27 @@ PASS_KERNEL sampling(
 
             // Choose the level: l = ceil(max(-log2 q, 0) / 2) exceeds k exactly where q < 4^-k.
 #if MIP_RULE == 0
-            const uint level = 0;
+            const uint level = 0u;
             const int level_x = texel_x, level_y = texel_y;
 #else
 #if MIP_RULE == 1
             const float q = p * mip_factor;  // Eq 5.12
 #else
-            const float q = p * mip_factor / r;  // [KC08] 1 over texels of level 0 per sample
+            const float q = p * mip_factor / r;  // [KC08] samples per texel of level 0
 #endif
             const int finer = (q < 1.0f) + (q < 0x1p-2f) + (q < 0x1p-4f) + (q < 0x1p-6f) + (q < 0x1p-8f);
             const uint level = (uint)(finer < num_levels ? finer : num_levels - 1);
-            const int level_x = (int)(at_x * ratio[2 * level]);
-            const int level_y = (int)(at_y * ratio[2 * level + 1]);
+            const int level_x = (int)(at_x * ratio[2u * level]);
+            const int level_y = (int)(at_y * ratio[2u * level + 1u]);
 #endif
 
             // Fetch.
-            const float4 colour = load_setup(setup_texture, setup_index(level, level_y, level_x, width, height));
+            const uint at = 2u * setup_index(level, level_y, level_x, width, height);
+            const uint red_green = setup_texture[at];
+            const uint blue_depth = setup_texture[at + 1u];
             TRACE(TRACE_COLOUR, active, level, level_y, level_x)
             const uint fetched = (uint)(texel_y * width + texel_x);
-            float common = active && profile_id[fetched] > 0 ? 1.0f : 0.0f;
+            float common = (active & (profile_id[fetched] > 0)) ? 1.0f : 0.0f;
 #if NORMAL_WEIGHTS
             common *= sqrt(half_cosine(normal[fetched], centre_normal));
             TRACE(TRACE_NORMAL, active, 0, texel_y, texel_x)
@@ -172,20 +180,17 @@ PASS_KERNEL sampling(
 
             // Weigh: each channel's profile at the distance in space, over the density that drew the sample.
 #if BILATERAL
-            const float dz = (colour.w - centre.w) * MM_PER_CM;
+            const float dz = (decode_half(blue_depth >> 16) - centre_depth) * MM_PER_CM;
             const float reach = sqrt(r * r + dz * dz);
 #else
             const float reach = r;
 #endif
-            const float2 red = profile_exponentials(reach * rate.x);
-            const float2 green = profile_exponentials(reach * rate.y);
-            const float2 blue = profile_exponentials(reach * rate.z);
-            const float weight_r = (red.y + red.x) * density.x * common;
-            const float weight_g = (green.y + green.x) * density.y * common;
-            const float weight_b = (blue.y + blue.x) * density.z * common;
-            sum_r += weight_r * colour.x;
-            sum_g += weight_g * colour.y;
-            sum_b += weight_b * colour.z;
+            const float weight_r = burley(reach * rate_r, 1.0f, 1.0f) * density_r * common;
+            const float weight_g = burley(reach * rate_g, 1.0f, 1.0f) * density_g * common;
+            const float weight_b = burley(reach * rate_b, 1.0f, 1.0f) * density_b * common;
+            sum_r += weight_r * decode_half(red_green);
+            sum_g += weight_g * decode_half(red_green >> 16);
+            sum_b += weight_b * decode_half(blue_depth);
             total_r += weight_r;
             total_g += weight_g;
             total_b += weight_b;
@@ -193,11 +198,13 @@ PASS_KERNEL sampling(
 
         if (scatters) {
 #if SELF_NORMALISED
-            result.x = total_r > 0.0f ? sum_r / total_r : centre.x;
-            result.y = total_g > 0.0f ? sum_g / total_g : centre.y;
-            result.z = total_b > 0.0f ? sum_b / total_b : centre.z;
+            result.x = total_r > 0.0f ? sum_r / total_r : centre_r;
+            result.y = total_g > 0.0f ? sum_g / total_g : centre_g;
+            result.z = total_b > 0.0f ? sum_b / total_b : centre_b;
 #if CENTRE_REWEIGHTING
-            result += (centre - result) * (1.0f - outer_share);
+            result.x += (centre_r - result.x) * (1.0f - beyond_r);
+            result.y += (centre_g - result.y) * (1.0f - beyond_g);
+            result.z += (centre_b - result.z) * (1.0f - beyond_b);
 #endif
 #else
             result.x = sum_r / (float)count;
@@ -205,7 +212,9 @@ PASS_KERNEL sampling(
             result.z = sum_b / (float)count;
 #if CENTRE_REWEIGHTING
             // The samples were drawn from the part of the profile beyond the centre texel.
-            result = result * outer_share.w + centre * (1.0f - outer_share);
+            result.x = result.x * beyond_s + centre_r * (1.0f - beyond_r);
+            result.y = result.y * beyond_s + centre_g * (1.0f - beyond_g);
+            result.z = result.z * beyond_s + centre_b * (1.0f - beyond_b);
 #endif
 #endif
             result.w = (float)count;

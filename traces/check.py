@@ -1,6 +1,7 @@
 """Invariants of a Trace: a bad trace is caught here, before it becomes a bad number.
 
-`check` reads a whole trace; `Checker` does the same chunk by chunk, for readers and writers that stream.
+`check` reads a whole trace; `Checker` does the same chunk by chunk, for readers and writers that
+stream.
 """
 
 from __future__ import annotations
@@ -27,7 +28,9 @@ MAX_INT32 = (1 << 31) - 1
 
 @dataclass(frozen=True)
 class Summary:
-    """What `check` counted on its way. num_rows: access instructions of warps. num_lane_fetches: active lanes of all rows."""
+    """What `check` counted on its way. num_rows: access instructions of warps. num_lane_fetches:
+    active lanes of all rows.
+    """
 
     num_launches: int
     num_ctas: int
@@ -41,7 +44,8 @@ def check(
 ) -> Summary:
     """Read every chunk of a trace and check all invariants.
 
-    where: what messages call the trace, for example its path. progress: told the number of lane fetches read so far.
+    where: what messages call the trace, for example its path. progress: told the number of lane
+        fetches read so far.
 
     Raises:
         InputError: the first broken invariant, with its place, its value and what is allowed.
@@ -57,9 +61,10 @@ def check(
 class Checker:
     """Checks chunks as they pass by, in order; `finish` then says whether anything is missing.
 
-    Invariants: launches in order; the CTAs of a launch contiguous from 0 and complete (a launch of 0 CTAs has no chunk);
-    `warp_offsets` int64 from 0, never falling, up to the number of rows, whole CTAs; instructions uint16, in range, of the launch's
-    pass; texels inside a level that exists, or addresses that are multiples of the access size.
+    Invariants: launches in order; the CTAs of a launch contiguous from 0 and complete (a launch of
+    0 CTAs has no chunk); `warp_offsets` int64 from 0, never falling, up to the number of rows,
+    whole CTAs; instructions uint16, in range, of the launch's pass; texels inside a level that
+    exists, or addresses that are multiples of the access size.
     """
 
     def __init__(self, trace: Trace, where: str = "trace") -> None:
@@ -114,17 +119,15 @@ class Checker:
     def check_launch(self, index: int) -> Launch:
         """The launch `index`, with its fields in range. Raises: InputError."""
         launch = self.trace.launches[index]
-        for field, value, least in (
-            ("num_ctas", launch.num_ctas, 0),
-            ("warps_per_cta", launch.warps_per_cta, 1),
-            ("frame", launch.frame, 0),
-            ("registers_per_thread", launch.registers_per_thread, 0),
-            ("shared_bytes_per_cta", launch.shared_bytes_per_cta, 0),
+        for field, value, least, most in (
+            ("num_ctas", launch.num_ctas, 0, MAX_INT32),
+            ("warps_per_cta", launch.warps_per_cta, 1, MAX_WARPS_PER_CTA),
+            ("frame", launch.frame, 0, MAX_INT32),
+            ("registers_per_thread", launch.registers_per_thread, 0, MAX_INT32),
+            ("shared_bytes_per_cta", launch.shared_bytes_per_cta, 0, MAX_INT32),
         ):
-            if not least <= value < 1 << 31:
-                raise self._fail(
-                    f"launch {index}: {field} {value}: allowed are {least} to 2^31 - 1"
-                )
+            if not least <= value <= most:
+                raise self._fail(f"launch {index}: {field} {value}: allowed are {least} to {most}")
         if any(count < 0 for _, count in launch.trailing_arithmetic):
             raise self._fail(f"launch {index}: trailing_arithmetic has a negative count")
         return launch
@@ -150,8 +153,8 @@ class Checker:
         self._advance_to(chunk.launch)
         if chunk.first_cta != self._next_cta:
             raise self._fail(
-                f"launch {chunk.launch}: chunk starts at CTA {chunk.first_cta}: must be {self._next_cta} "
-                "(CTAs in order, none left out)"
+                f"launch {chunk.launch}: chunk starts at CTA {chunk.first_cta}: "
+                f"must be {self._next_cta} (CTAs in order, none left out)"
             )
         return self.check_launch(chunk.launch)
 
@@ -160,7 +163,8 @@ class Checker:
         offsets, num_rows = chunk.warp_offsets, len(chunk.instruction)
         if offsets.dtype != np.int64 or offsets.ndim != 1 or not len(offsets):
             raise self._fail(
-                f"{place}: warp_offsets {offsets.dtype} of shape {offsets.shape}: need int64 (warps + 1,)"
+                f"{place}: warp_offsets {offsets.dtype} of shape {offsets.shape}: "
+                "need int64 (warps + 1,)"
             )
         if offsets[0] != 0 or offsets[-1] != num_rows or (np.diff(offsets) < 0).any():
             raise self._fail(
@@ -169,13 +173,13 @@ class Checker:
         num_ctas, rest = divmod(len(offsets) - 1, launch.warps_per_cta)
         if rest or chunk.first_cta + num_ctas > launch.num_ctas:
             raise self._fail(
-                f"{place}: {len(offsets) - 1} warps: need whole CTAs of {launch.warps_per_cta} warps, "
-                f"at most {launch.num_ctas - chunk.first_cta} of them"
+                f"{place}: {len(offsets) - 1} warps: need whole CTAs of {launch.warps_per_cta} "
+                f"warps, at most {launch.num_ctas - chunk.first_cta} of them"
             )
         if chunk.instruction.dtype != np.uint16 or chunk.instruction.ndim != 1:
             raise self._fail(
-                f"{place}: instruction {chunk.instruction.dtype} of shape {chunk.instruction.shape}: "
-                "need uint16 (rows,)"
+                f"{place}: instruction {chunk.instruction.dtype} of shape "
+                f"{chunk.instruction.shape}: need uint16 (rows,)"
             )
         dtype = np.uint64 if self.trace.is_lane_address else np.uint32
         if chunk.lanes.dtype != dtype or chunk.lanes.shape != (num_rows, WARP_SIZE):
@@ -219,8 +223,8 @@ class Checker:
         value = chunk.lanes[row, lane]
         if self.trace.is_lane_address:
             return (
-                f"{place}, lane {lane}: address {int(value):#x}: allowed are multiples of the access size, "
-                f"{instruction.access_bytes} B"
+                f"{place}, lane {lane}: address {int(value):#x}: "
+                f"allowed are multiples of the access size, {instruction.access_bytes} B"
             )
         texture = self.trace.textures[instruction.texture]
         mip, y, x = (int(v) for v in unpack_texel(value))
@@ -259,12 +263,17 @@ def _instruction_problem(instruction: Instruction, trace: Trace) -> str:
         return f"texture {instruction.texture}: allowed are 0 to {len(trace.textures) - 1}"
     texel_bytes = trace.textures[instruction.texture].texel_bytes
     if instruction.access_bytes not in (0, texel_bytes):
-        return f"access_bytes {instruction.access_bytes}: allowed are 0 and the texel's size, {texel_bytes}"
+        return (
+            f"access_bytes {instruction.access_bytes}: "
+            f"allowed are 0 and the texel's size, {texel_bytes}"
+        )
     return ""
 
 
 def level_sizes(trace: Trace) -> tuple[npt.NDArray[np.uint32], npt.NDArray[np.uint32]]:
-    """Two (num_instructions, 16) uint32: texels across and down of each level of each instruction's texture; 0 = no such level."""
+    """Two (num_instructions, 16) uint32: texels across and down of each level of each instruction's
+    texture; 0 = no such level.
+    """
     widths, heights = np.zeros((2, len(trace.instructions), 16), np.uint32)
     if not trace.is_lane_address:
         for index, instruction in enumerate(trace.instructions):
@@ -276,7 +285,9 @@ def level_sizes(trace: Trace) -> tuple[npt.NDArray[np.uint32], npt.NDArray[np.ui
 
 @njit(cache=True, nogil=True)
 def first_bad_texel(lanes: Any, instruction: Any, of_pass: Any, widths: Any, heights: Any) -> Any:
-    """(row, lane, active lanes of all rows) of the first row with a wrong instruction or texel; row -1 if all are right."""
+    """(row, lane, active lanes of all rows) of the first row with a wrong instruction or texel; row
+    -1 if all are right.
+    """
     active = 0
     low = np.uint32(0x3FFF)
     for row in range(lanes.shape[0]):
@@ -296,7 +307,9 @@ def first_bad_texel(lanes: Any, instruction: Any, of_pass: Any, widths: Any, hei
 
 @njit(cache=True, nogil=True)
 def first_bad_address(lanes: Any, instruction: Any, of_pass: Any, access_bytes: Any) -> Any:
-    """As `first_bad_texel`, for byte addresses, which must be multiples of the access size (a power of two)."""
+    """As `first_bad_texel`, for byte addresses, which must be multiples of the access size (a power
+    of two).
+    """
     active = 0
     for row in range(lanes.shape[0]):
         index = instruction[row]

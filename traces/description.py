@@ -1,7 +1,9 @@
-"""The description of a trace (all but its rows) as JSON texts in a file's metadata, and back with every field checked.
+"""The description of a trace (all but its rows) as JSON texts in a file's metadata, and back with
+every field checked.
 
-One JSON text per key: `version`, `manifest`, `textures`, `instructions`, `launches`, and `chunks`, which lists
-[launch, first CTA, CTAs, rows] for each piece of the file in order; a piece without rows has no row group.
+One JSON text per key: `version`, `manifest`, `textures`, `instructions`, `launches`, and `chunks`,
+which lists [launch, first CTA, CTAs, rows] for each piece of the file in order; a piece without
+rows has no row group.
 """
 
 from __future__ import annotations
@@ -81,14 +83,15 @@ def from_metadata(metadata: Mapping[bytes, bytes], where: str) -> Description:
             first = error.errors(include_url=False)[0]
             place = ".".join(str(part) for part in first["loc"])
             shown = repr(first["input"])[:60]
-            raise InputError(
-                f"{where}: metadata {key!r}{' at ' + place if place else ''}: {shown}: {first['msg']}"
-            ) from None
+            at = f" at {place}" if place else ""
+            raise InputError(f"{where}: metadata {key!r}{at}: {shown}: {first['msg']}") from None
     return Description(**values)
 
 
 def _text(metadata: Mapping[bytes, bytes], key: str, where: str) -> bytes:
     text = metadata.get((PREFIX + key).encode())
     if text is None:
-        raise InputError(f"{where}: metadata {PREFIX + key!r} is missing: not a trace of this program")
+        raise InputError(
+            f"{where}: metadata {PREFIX + key!r} is missing: not a trace of this program"
+        )
     return text

@@ -14,8 +14,8 @@ from traces.errors import InputError, WorkError
 def replacing(path: str | Path) -> Iterator[Path]:
     """A temporary path beside `path`, with its suffix, for the block to write to.
 
-    When the block ends, the temporary file takes the place of `path`; when it fails or is interrupted, the file is removed and
-    whatever stood at `path` stays.
+    When the block ends, the temporary file takes the place of `path`; when it fails or is
+    interrupted, the file is removed and whatever stood at `path` stays.
 
     Raises:
         InputError: the folder does not exist or may not be written to, or `path` is a folder.

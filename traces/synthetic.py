@@ -1,7 +1,8 @@
 """Traces made from a formula instead of a recording: for tests, benchmarks and the guide.
 
-All but `stream` work on 8x8 tiles in raster order, one tile per CTA, two warps of 8x4 pixels each, lanes row-major; pixels beyond the
-edge are inactive. They make their chunks anew at every pass over the trace, from a seed, a row of tiles at a time.
+All but `stream` work on 8x8 tiles in raster order, one tile per CTA, two warps of 8x4 pixels each,
+lanes row-major; pixels beyond the edge are inactive. They make their chunks anew at every pass over
+the trace, from a seed, a row of tiles at a time.
 """
 
 from __future__ import annotations
@@ -25,14 +26,18 @@ _BURLEY_C = 2.5715
 _SKIN_D_MM, _SKIN_MEAN_FREE_PATH_MM = 1.8, 26.748
 
 Pixels = npt.NDArray[np.int64]
-#: rows(x, y, inside, random) -> (warps, rows, 32) uint32 packed texels of a row of tiles, from (warps, 32) pixels.
-Rows = Callable[[Pixels, Pixels, npt.NDArray[np.bool_], np.random.Generator], npt.NDArray[np.uint32]]
+#: rows(x, y, inside, random) -> (warps, rows, 32) uint32 packed texels of a row of tiles, from
+#: (warps, 32) pixels.
+Rows = Callable[
+    [Pixels, Pixels, npt.NDArray[np.bool_], np.random.Generator], npt.NDArray[np.uint32]
+]
 
 
 def stream(
     num_warps: int, loads_per_warp: int = 16, bytes_per_lane: int = 8, warps_per_cta: int = 8
 ) -> Trace:
-    """A lane-address trace in which every lane reads its own bytes once: load i of all warps is one contiguous run.
+    """A lane-address trace in which every lane reads its own bytes once: load i of all warps is one
+    contiguous run.
 
     num_warps: a multiple of warps_per_cta. bytes_per_lane: 1, 2, 4, 8 or 16.
     """
@@ -44,7 +49,9 @@ def stream(
             warp = first * warps_per_cta + np.arange(num)[:, None, None]
             load = np.arange(loads_per_warp)[None, :, None]
             lane = np.arange(WARP_SIZE)
-            address = _BASE_ADDRESS + ((load * num_warps + warp) * WARP_SIZE + lane) * bytes_per_lane
+            address = (
+                _BASE_ADDRESS + ((load * num_warps + warp) * WARP_SIZE + lane) * bytes_per_lane
+            )
             yield _chunk(0, first, address.astype(np.uint64), np.zeros(loads_per_warp, np.uint16))
 
     instruction = Instruction("import", -1, access_bytes=bytes_per_lane)
@@ -63,9 +70,13 @@ def pixel_pass(texture: Texture, operation: str = "load", mip: int = 0) -> Trace
 
 
 def gather(texture: Texture, radius_texels: int, num_samples: int, seed: int = 0) -> Trace:
-    """Each lane loads `num_samples` texels of mip 0, uniform in the square of +- `radius_texels` around its own, clamped."""
+    """Each lane loads `num_samples` texels of mip 0, uniform in the square of +- `radius_texels`
+    around its own, clamped.
+    """
 
-    def rows(x: Pixels, y: Pixels, inside: Any, random: np.random.Generator) -> npt.NDArray[np.uint32]:
+    def rows(
+        x: Pixels, y: Pixels, inside: Any, random: np.random.Generator
+    ) -> npt.NDArray[np.uint32]:
         shape = (2, len(x), num_samples, WARP_SIZE)
         dx, dy = random.integers(-radius_texels, radius_texels, shape, endpoint=True)
         at_x = np.clip(x[:, None] + dx, 0, texture.width - 1)
@@ -87,17 +98,25 @@ def scatter(
     seed: int = 0,
     frames: int = 1,
 ) -> Trace:
-    """What the sampling pass looks like: a centre fetch, then per sample colour at mip l, normal and profile id at mip 0.
+    """What the sampling pass looks like: a centre fetch, then per sample colour at mip l, normal
+    and profile id at mip 0.
 
-    Radii follow Burley's profile of skin, angles are uniform, and l is the dissertation's Eq 5.12. It shares no code with the
-    recorder and no bits with any recording.
+    Radii follow Burley's profile of skin, angles are uniform, and l is the dissertation's Eq 5.12.
+    It shares no code with the recorder and no bits with any recording.
 
-    adaptive: lanes stop after a random count from 1 to `num_samples`, alike in a warp but not equal.
+    adaptive: lanes stop after a random count from 1 to `num_samples`, alike in a warp but not
+        equal.
     """
     colour = Texture("setup", "RGBA16F", width, height, 6)
-    planes = [colour, Texture("normal", "RGBA8", width, height), Texture("profile id", "R8", width, height)]
+    planes = [
+        colour,
+        Texture("normal", "RGBA8", width, height),
+        Texture("profile id", "R8", width, height),
+    ]
 
-    def rows(x: Pixels, y: Pixels, inside: Any, random: np.random.Generator) -> npt.NDArray[np.uint32]:
+    def rows(
+        x: Pixels, y: Pixels, inside: Any, random: np.random.Generator
+    ) -> npt.NDArray[np.uint32]:
         shape = (len(x), num_samples, WARP_SIZE)
         xi, turn = random.random((2, *shape))
         count = np.full((len(x), 1, 1), num_samples)
@@ -124,10 +143,13 @@ def scatter(
 
 
 def _mip(xi: npt.NDArray[np.float64], count: Pixels, pixels_per_mm: float) -> Pixels:
-    """Eq 5.12 with a = 1/16 and p = Burley's radial density in 1/mm at the radius of `xi`; rounded up, clamped to 0..5."""
+    """Eq 5.12 with a = 1/16 and p = Burley's radial density in 1/mm at the radius of `xi`; rounded
+    up, clamped to 0..5.
+    """
     r = ((2 - _BURLEY_C) * xi - 2) * np.log1p(-xi)
     density = (np.exp(-r) + np.exp(-r / 3)) / (4 * _SKIN_D_MM)
-    # t, the UV area of a square mm, is that of a 1080p frame whatever the trace's size, so that small traces look like large ones.
+    # t, the UV area of a square mm, is that of a 1080p frame whatever the trace's size, so that
+    # small traces look like large ones.
     t = pixels_per_mm**2 / (1920 * 1080)
     level = -0.5 * np.log2(density * count / (16 * _SKIN_MEAN_FREE_PATH_MM**2 * t))
     return np.clip(np.ceil(level), 0, 5).astype(np.int64)
@@ -143,11 +165,14 @@ def _tiled(
     rows: Rows,
     frames: int = 1,
 ) -> Trace:
-    """A trace of one launch per frame. program: the instruction of each row of a warp. Warps' fully inactive rows are left out."""
+    """A trace of one launch per frame. program: the instruction of each row of a warp. Warps' fully
+    inactive rows are left out.
+    """
     width, height = size
     across, down = -(-width // _TILE), -(-height // _TILE)
     launches = [
-        Launch(frame, instructions[0].pass_name, across * down, WARPS_PER_TILE) for frame in range(frames)
+        Launch(frame, instructions[0].pass_name, across * down, WARPS_PER_TILE)
+        for frame in range(frames)
     ]
 
     def chunks() -> Iterator[Chunk]:
@@ -162,11 +187,17 @@ def _tiled(
                 made = rows(x, y, inside, random)
                 yield _chunk(frame, tile_y * across, made, np.array(program, np.uint16))
 
-    return Trace({"scene": scene, "seed": seed}, list(textures), list(instructions), launches, chunks)
+    return Trace(
+        {"scene": scene, "seed": seed}, list(textures), list(instructions), launches, chunks
+    )
 
 
-def _chunk(launch: int, first_cta: int, lanes: npt.NDArray[Any], program: npt.NDArray[np.uint16]) -> Chunk:
-    """The chunk of (warps, rows, 32) lanes in which every warp runs the same program; rows without an active lane are left out."""
+def _chunk(
+    launch: int, first_cta: int, lanes: npt.NDArray[Any], program: npt.NDArray[np.uint16]
+) -> Chunk:
+    """The chunk of (warps, rows, 32) lanes in which every warp runs the same program; rows without
+    an active lane are left out.
+    """
     num_warps, num_rows, _ = lanes.shape
     instruction = np.tile(program, num_warps)
     kept = np.ones((num_warps, num_rows), bool)

@@ -1,0 +1,151 @@
+"""What pre-filtering does to cache misses: mip 0 forced against Eq 5.12, sample by sample alike.
+
+In go scenes, counts, scales and sets of planes; out come the sampling pass's miss rates at L1 and
+L2 and its DRAM traffic with either mip rule. Both runs take the same samples, so every difference
+comes from the level that a sample reads.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from itertools import product
+from typing import TYPE_CHECKING, Any
+
+import pandas as pd
+
+from cachesim import simulate
+from cachesim.report import sum_parts
+from experiments.tables import Column, Table
+from kernels.method import PLANES, Method
+from kernels.record import record
+
+if TYPE_CHECKING:
+    from cachesim import Report
+    from cachesim.config import Gpu
+    from kernels.device import Device
+    from kernels.gbuffer import GBuffer
+
+COUNTS = (8, 16, 64)
+SCALES = ("legacy", "physical")
+PLANE_SETS = {"irradiance": ("colour",), "all": PLANES}
+RULES = ("mip0", "eq-5.12")
+
+
+def cases(
+    counts: Sequence[int] = COUNTS, scales: Sequence[str] = SCALES
+) -> Iterator[tuple[str, int, str]]:
+    """(scale, count, plane set) in the order of the table."""
+    return product(scales, counts, PLANE_SETS)
+
+
+def measure(
+    label: str,
+    gbuffer: GBuffer,
+    gpu: Gpu,
+    *,
+    counts: Sequence[int] = COUNTS,
+    scales: Sequence[str] = SCALES,
+    device: Device | None = None,
+    step: Callable[[str], None] = lambda _: None,
+) -> pd.DataFrame:
+    """One row per scale, count and plane set of one scene.
+
+    Columns `l1_mip0`, `l1_eq` and so on: miss rates of the sampling pass; `dram_mb_*` its traffic;
+    `mean_level` the mean mip level of the irradiance fetches under Eq 5.12.
+    """
+    rows = []
+    for scale, count, planes in cases(counts, scales):
+        step(f"{label}: {scale} scale, {count} samples, {planes}")
+        row: dict[str, Any] = {
+            "scene": label,
+            "scale": scale,
+            "pixels_per_mm": gbuffer.pixels_per_mm() * (10 / 3 if scale == "legacy" else 1),
+            "count": count,
+            "planes": planes,
+        }
+        for rule in RULES:
+            method = Method(
+                num_samples=count,
+                scale=scale,
+                mip_rule=rule,
+                prefilter=rule != "mip0",
+                planes=PLANE_SETS[planes],
+                passes=("setup", "prefilter", "sampling"),
+            )
+            report = simulate(record(gbuffer, method, device=device), gpu)
+            row |= _sampling_row(report, rule.partition("-")[0])
+        rows.append(row)
+    return pd.DataFrame(rows)
+
+
+def _sampling_row(report: Report, suffix: str) -> dict[str, float]:
+    """The sampling pass's miss rates and DRAM megabytes; for Eq 5.12 also the mean level."""
+    parts = [p for p in report.parts or () if p.pass_name == "sampling"]
+    row: dict[str, float] = {}
+    for level in ("l1", "l2"):
+        counts = sum_parts(parts, level)
+        row[f"{level}_{suffix}"] = counts.misses / max(counts.accesses, 1)
+    row[f"dram_mb_{suffix}"] = sum(p.dram.bytes for p in parts) / 1e6
+    if suffix == "eq":
+        setup = [p for p in parts if p.texture == "setup"]
+        fetches = sum(p.lane_fetches for p in setup)
+        row["mean_level"] = sum(p.mip * p.lane_fetches for p in setup) / max(fetches, 1)
+    return row
+
+
+def effect_table(frame: pd.DataFrame, gpu: str, size: str) -> Table:
+    """The study's table, with what we understand of it under it."""
+    columns = (
+        Column("scene", "scene"),
+        Column("scale", "scale"),
+        Column("planes", "planes"),
+        Column("count", "samples"),
+        Column("pixels_per_mm", "px per mm", ".1f"),
+        Column("mean_level", "mean level", ".2f"),
+        Column("l1_mip0", "L1 miss mip 0", ".3f"),
+        Column("l1_eq", "L1 miss Eq 5.12", ".3f"),
+        Column("l2_mip0", "L2 miss mip 0", ".3f"),
+        Column("l2_eq", "L2 miss Eq 5.12", ".3f"),
+        Column("dram_mb_mip0", "DRAM MB mip 0", ",.1f"),
+        Column("dram_mb_eq", "DRAM MB Eq 5.12", ",.1f"),
+    )
+    return Table(
+        f"Pre-filtering and misses: sampling pass, {gpu}, {size}", frame, columns, tuple(explain(frame))
+    )
+
+
+def explain(frame: pd.DataFrame) -> list[str]:
+    """Sentences on the study: why it moves as it does, its extremes, and the paper."""
+    change = frame["l1_eq"] - frame["l1_mip0"]
+    best, worst = frame.loc[change.idxmin()], frame.loc[change.idxmax()]
+    lines = [
+        "Eq 5.12 chooses a coarser level the wider the scatter is in pixels and the fewer the samples "
+        "(half a level per halving of the count), and only for the irradiance texture: normals and "
+        "profile ids are read at full size whatever the level. So the gain is large where a mm is many "
+        "pixels (close, legacy scale) with few samples on irradiance alone, and shrinks when the other "
+        "planes, which do not change, are counted with it.",
+        "Where nearly every sample reads mip 0, the rule costs a little instead: the few coarse fetches "
+        "bring a second level's lines into the cache beside mip 0's.",
+        f"Largest fall of the L1 miss rate: {_case(best)}; "
+        + (
+            f"largest rise: {_case(worst)}."
+            if change.max() > 0
+            else f"smallest fall: {_case(worst)}."
+        ),
+        "The paper credits pre-filtering with 22x between the unaccelerated fixed baseline and fixed with "
+        "mips (253.18 ms against 11.47 ms, close). DRAM traffic alone does not explain that here: its "
+        f"largest factor, mip 0 over Eq 5.12, is {_largest_factor(frame):.1f}.",
+    ]
+    return lines
+
+
+def _case(row: pd.Series) -> str:
+    return (
+        f"{row['l1_mip0']:.3f} to {row['l1_eq']:.3f} ({row['scene']}, {row['scale']}, "
+        f"{row['count']} samples, {row['planes']})"
+    )
+
+
+def _largest_factor(frame: pd.DataFrame) -> float:
+    return float((frame["dram_mb_mip0"] / frame["dram_mb_eq"].clip(lower=1e-9)).max())

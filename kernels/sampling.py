@@ -1,0 +1,273 @@
+"""Sampling pass: filtered importance sampling around each scattering pixel, with a fixed or an estimated sample count.
+
+Facts sheet 2.3 to 2.7. The twin of sampling.cl and estimate.cl, operation by operation. Left out of the engine's estimator: its
+division by 0.99995, boundary colour bleed (there is one profile) and the opacity fade.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from kernels import resources
+from kernels.access import Access
+from kernels.grid import Grid
+from kernels.method import Method
+from kernels.polynomial import poly_cbrt, poly_cos_sin, poly_exp, poly_log
+from kernels.profile import APPROXIMATE_C
+from kernels.sequence import pcg3d16, r2
+from kernels.setup import texels
+from kernels.update import has_history, history_names, read_history, reproject
+from traces.texture import INACTIVE_TEXEL, pack_texel
+
+_F = np.float32
+_ONE = _F(1)
+_PDF_MIN = _F(1e-5)
+_RADIUS_MIN = _F(1e-5)
+_EXPONENT_MIN = _F(-28)
+_MM_PER_CM = _F(10)
+_C = _F(APPROXIMATE_C)
+#: The constant `a` of Eq 5.12, chosen by its author to damp the influence of the count.
+MIP_DAMPING = 1.0 / 16.0
+Texels = npt.NDArray[np.uint32]
+
+
+@dataclass(frozen=True)
+class Constants:
+    """The pass's numbers that one picture fixes, as float32.
+
+    texels_per_mm_at_cm: texels per mm at a depth of 1 cm. d: the sampled channel's profile scale, mm. rate, density: -1 / (3 d), 1/mm,
+    and 1 / (4 d), 1/mm, of red, green, blue and the sampled channel. mip_scale: the mip rule's factor. ratio: (num_levels, 2), width and
+    height of each level over those of level 0.
+    """
+
+    texels_per_mm_at_cm: np.float32
+    d: np.float32
+    rate: npt.NDArray[np.float32]
+    density: npt.NDArray[np.float32]
+    mip_scale: np.float32
+    ratio: npt.NDArray[np.float32]
+
+    @staticmethod
+    def of(method: Method, width: int, height: int, projection_x: float) -> Constants:
+        """The constants for a frame. projection_x: 1 / tan(fov_x / 2)."""
+        profile = method.profile
+        d = np.array([*profile.d_mm, profile.d_sampled_mm])
+        # Facts sheet 2.5: UV per mm at depth z is 0.05 M / z, or M / (6 z) in the engine before its correction.
+        step = 0.05 if method.scale == "physical" else 1.0 / 6.0
+        if method.mip_rule == "textbook":
+            mip_scale = 1.0 / (2.0 * np.pi)
+        else:
+            # a / lmax^2 / t, t = (texels per mm)^2 / (width height).
+            mip_scale = MIP_DAMPING * width * height / profile.dmfp_max_mm**2
+        levels = range(resources.count_levels(width, height, method))
+        ratio = [[_F(width >> k) / _F(width), _F(height >> k) / _F(height)] for k in levels]
+        return Constants(
+            _F(width * step * projection_x),
+            _F(d[3]),
+            (-1.0 / (3.0 * d)).astype(np.float32),
+            (1.0 / (4.0 * d)).astype(np.float32),
+            _F(mip_scale),
+            np.array(ratio, np.float32),
+        )
+
+
+def accesses(method: Method, frame: int) -> tuple[Access, ...]:
+    """The pass's traced accesses; arithmetic counts are assumed, from reading the kernel."""
+    colour = "colour" in method.planes
+    normal = "normal" in method.planes and method.normal_weights
+    planes = [
+        Access("setup", in_loop=True, arithmetic=(("int", 14), ("fp32", 46), ("sfu", 5)), num_outstanding=0)
+    ] * colour
+    planes += [Access("normal", in_loop=True, arithmetic=(("int", 3),), num_outstanding=1)] * normal
+    planes += [
+        Access("profile_id", in_loop=True, arithmetic=(("int", 2),), num_outstanding=2)
+    ] * ("profile_id" in method.planes)
+    found = [Access("setup", arithmetic=(("int", 12),))] * colour
+    found += [Access("normal", subsurface_only=True, arithmetic=(("int", 2),))] * normal
+    if method.adaptive:
+        found += [
+            Access("velocity", subsurface_only=True),
+            Access(
+                history_names(frame)[0],
+                subsurface_only=True,
+                arithmetic=(("fp32", 4), ("int", 4)),
+                num_outstanding=2,
+            ),
+        ]
+    store = Access(
+        "scattered", "store", arithmetic=(("fp32", 60), ("int", 16), ("sfu", 12)), num_outstanding=0
+    )
+    return (*found, *planes, store)
+
+
+def estimate_reference(
+    grid: Grid, textures: dict[str, Any], method: Method, frame: int
+) -> npt.NDArray[np.int32]:
+    """(num_warps, 32) samples of each lane; 0 where nothing scatters."""
+    depth = grid.gather(textures["setup"][0][..., 3]).astype(_F)
+    scatters = grid.inside & (depth > 0)
+    if not method.adaptive:
+        return np.where(scatters, method.num_samples, 0).astype(np.int32)
+    past_x, past_y, on_screen = reproject(grid, textures, scatters)
+    history = read_history(textures[history_names(frame)[0]], past_x, past_y, on_screen)
+    known = has_history(history, depth)
+    mean_count = np.where(known, history[..., 0], _F(method.b_max))
+    variance = np.where(known, history[..., 2], _F(method.sigma0_sq))
+    count = estimate_count(mean_count, variance, method)
+    return np.where(scatters, np.floor(count + _F(0.5)).astype(np.int32), 0)
+
+
+def estimate_count(mean_count: Any, variance: Any, method: Method) -> Any:
+    """The next frame's count before rounding, clamped to [b_min, b_max]; float32. Facts sheet 3.2."""
+    s0 = _F(method.sigma0_sq)
+    if method.rule == "paper":
+        delta = (variance - s0) / s0 * mean_count * _F(k_minus_1(method))
+        count = _F(method.kappa) * delta + variance / s0 * mean_count
+    else:
+        count = variance / s0
+    return np.clip(count, _F(method.b_min), _F(method.b_max))
+
+
+def k_minus_1(method: Method) -> float:
+    """k - 1 for the simple moving average of k = 2 / alpha - 1 frames that the history's alpha stands for."""
+    return 2.0 / method.alpha - 2.0
+
+
+def burley(x: Any, w_wide: np.float32 = _ONE, w_narrow: np.float32 = _ONE) -> Any:
+    """w_wide e^x + w_narrow e^3x, x at least -28: with x = -r / (3 d) and weights 1, Burley's profile but for its factor."""
+    wide = poly_exp(np.maximum(x, _EXPONENT_MIN))
+    return w_narrow * (wide * wide * wide) + w_wide * wide
+
+
+def invert_cdf(complement: Any, exact: bool) -> Any:
+    """Radius over d for xi_1, given its complement 1 - xi_1 in (0, 1]; float32."""
+    if exact:
+        root = np.sqrt(_ONE + _F(4) * complement * complement)
+        g = poly_cbrt(_ONE + _F(4) * complement * (_F(2) * complement + root))
+        return _F(3) * poly_log((_ONE + _ONE / g + g) / (_F(4) * complement))
+    return ((_F(2) - _C) * (_ONE - complement) - _F(2)) * poly_log(complement)
+
+
+def half_cosine(n: Any, m: Any) -> Any:
+    """0.5 + 0.5 N.M of packed normals, in [0, 1]; float32."""
+    dot = np.zeros(np.broadcast_shapes(n.shape, m.shape), np.int32)
+    for shift in (np.uint32(0), np.uint32(10), np.uint32(20)):
+        a, b = (((v >> shift) & np.uint32(1023)).astype(np.int32) * 2 - 1023 for v in (n, m))
+        dot += a * b
+    return np.clip(_F(0.5) + _F(0.5) * (dot.astype(_F) * (_ONE / _F(1046529))), _F(0), _ONE)
+
+
+def find_level(q: Any, num_levels: int) -> Any:
+    """ceil(max(-log2 q, 0) / 2), at most 5 and the last level: it exceeds k exactly where q < 4^-k. int32."""
+    finer = sum((q < _F(4.0**-k)).astype(np.int32) for k in range(5))
+    return np.minimum(finer, num_levels - 1)
+
+
+def reference(
+    grid: Grid,
+    textures: dict[str, Any],
+    method: Method,
+    constants: Constants,
+    num_levels: int,
+    frame: int,
+    counts: npt.NDArray[np.int32],
+) -> list[Texels]:
+    """Write `scattered`; the texels of each access, those of the loop (num_steps, num_warps, 32)."""
+    from kernels.reference import scatter
+
+    x, y = grid.lanes
+    centre = np.where(grid.inside[..., None], grid.gather(textures["setup"][0]), 0).astype(_F)
+    scatters = counts > 0
+    centre_normal = grid.gather(textures["normal"])
+    everywhere, mine = texels(grid, grid.inside), texels(grid, scatters)
+
+    depth = np.where(scatters, centre[..., 3], _ONE)
+    texels_per_mm = constants.texels_per_mm_at_cm / depth
+    mip_factor = constants.mip_scale * counts.astype(_F) / (texels_per_mm * texels_per_mm)
+    radius_centre = _ONE / texels_per_mm
+    beyond = [burley(radius_centre * rate, _F(0.75), _F(0.25)) for rate in constants.rate]
+    unit = _F(2.0**-24) * (beyond[3] if method.centre_reweighting else _ONE)
+
+    start = pcg3d16(x, y, frame, method.hash)[0]
+    sums = [np.zeros(x.shape, _F) for _ in range(3)]
+    totals = [np.zeros(x.shape, _F) for _ in range(3)]
+    fetched: list[list[Texels]] = [[], [], []]
+    for i in range(int(counts.max())):
+        active = i < counts
+        turn_r, turn_angle = r2(start + np.uint32(i))
+        complement = (np.uint32(0x1000000) - (turn_r >> np.uint32(8))).astype(_F) * unit
+        cosine, sine = poly_cos_sin(turn_angle)
+        exact = method.inverse_cdf == "exact"
+        r = np.maximum(constants.d * invert_cdf(complement, exact), _RADIUS_MIN)
+        p = np.maximum(burley(r * constants.rate[3]) * constants.density[3], _PDF_MIN)
+
+        at = [
+            np.clip(
+                middle.astype(_F) + _F(0.5) + r * texels_per_mm * direction, _F(0.5), _F(size) - _F(0.5)
+            )
+            for middle, direction, size in ((x, cosine, grid.width), (y, sine, grid.height))
+        ]
+        texel_x, texel_y = (a.astype(np.int32) for a in at)
+        if method.mip_rule == "mip0" or not method.prefilter:
+            level = np.zeros(x.shape, np.int32)
+        else:
+            q = p * mip_factor / r if method.mip_rule == "textbook" else p * mip_factor
+            level = find_level(q, num_levels)
+        level_x, level_y = ((a * constants.ratio[level, k]).astype(np.int32) for k, a in enumerate(at))
+        colour = np.zeros((*x.shape, 4), _F)
+        for k in range(num_levels):
+            here = level == k
+            colour[here] = textures["setup"][k][level_y[here], level_x[here]]
+
+        common = (active & (textures["profile_id"][texel_y, texel_x] > 0)).astype(_F)
+        if method.normal_weights:
+            common = common * np.sqrt(half_cosine(textures["normal"][texel_y, texel_x], centre_normal))
+        common = common / p
+        reach = r
+        if method.bilateral:
+            dz = (colour[..., 3] - centre[..., 3]) * _MM_PER_CM
+            reach = np.sqrt(r * r + dz * dz)
+        for c in range(3):
+            weight = burley(reach * constants.rate[c]) * constants.density[c] * common
+            sums[c] = sums[c] + weight * colour[..., c]
+            totals[c] = totals[c] + weight
+        own = np.where(active, pack_texel(0, texel_y, texel_x), INACTIVE_TEXEL)
+        fetched[0].append(np.where(active, pack_texel(level, level_y, level_x), INACTIVE_TEXEL))
+        fetched[1].append(own)
+        fetched[2].append(own)
+
+    result = np.zeros((*x.shape, 4), _F)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        for c in range(3):
+            share = beyond[c]
+            if method.weights == "self-normalised":
+                value = np.where(totals[c] > 0, sums[c] / totals[c], centre[..., c])
+                if method.centre_reweighting:
+                    value = value + (centre[..., c] - value) * (_ONE - share)
+            else:
+                value = sums[c] / counts.astype(_F)
+                if method.centre_reweighting:
+                    value = value * beyond[3] + centre[..., c] * (_ONE - share)
+            result[..., c] = value
+    result[..., 3] = counts
+    result = np.where(scatters[..., None], result, _F(0))
+    textures["scattered"] = scatter(grid, resources.to_half(result))
+
+    found: list[Texels] = []
+    loop = iter(np.array(plane) for plane in fetched)
+    colour_loop, normal_loop, id_loop = loop
+    past_x, past_y, on_screen = reproject(grid, textures, scatters)
+    past = np.where(on_screen, pack_texel(0, past_y, past_x), INACTIVE_TEXEL)
+    for access in accesses(method, frame):
+        by_name = {"setup": colour_loop, "normal": normal_loop, "profile_id": id_loop}
+        if access.in_loop:
+            found.append(by_name[access.texture])
+        elif access.texture in ("setup", "scattered"):
+            found.append(everywhere)
+        else:
+            found.append(past if access.texture.startswith("history") else mine)
+    return found
