@@ -11,10 +11,10 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from cachesim.stream import GROUP_BITS, LOAD, OPERATION_CODES, STORE, Requests
+from cachesim.stream import GROUP_BITS, OPERATION_CODES, STORE
 from traces.footprint import texel_offset
 from traces.placement import AddressMap
-from traces.texture import MAX_MIPS
+from traces.texture import INACTIVE_ADDRESS, INACTIVE_TEXEL, MAX_MIPS
 from traces.trace import Trace
 
 U64, U32, U8 = np.uint64, np.uint32, np.uint8
@@ -98,224 +98,227 @@ def placement_of(address_map: AddressMap | None) -> Placement:
     )
 
 
-@njit(cache=True, nogil=True, inline="always")
-def _texel_sector(texture, mip, y, x, place, shift):  # type: ignore[no-untyped-def]
-    x_entry = place.x_tables[U64(place.x_start[texture, mip]) + x]
-    y_entry = place.y_tables[U64(place.y_start[texture, mip]) + y]
-    return (
-        place.base[texture, mip] + U64(texel_offset(x_entry, y_entry, place.low_mask[texture]))
-    ) >> shift
+@njit(cache=True, nogil=True, _nrt=False, inline="always")
+def _address(x_tables, y_tables, x_start, y_start, base, low_mask, y, x):  # type: ignore[no-untyped-def]
+    """Byte address of a texel of one level."""
+    return base + U64(texel_offset(x_tables[x_start + x], y_tables[y_start + y], low_mask))
 
 
-@njit(cache=True, nogil=True, inline="always")
-def _texel_sectors(row, texture, bilinear, place, shift, first, keys, mips):  # type: ignore[no-untyped-def]
-    """Sectors of the active lanes' texels, less `first`, into keys; mips: lanes per mip, added to. Returns how many keys."""
+@njit(cache=True, nogil=True, _nrt=False)
+def _texel_sectors(  # type: ignore[no-untyped-def]
+    lanes, slot, texture, bilinear, place, shift, first, scratch, lane_fetches, group
+):
+    """Sectors of a row's texels, less `first`, into scratch.keys; lane fetches counted per mip.
+
+    Returns how many keys, or -1 where a lane asks for a texel that its texture does not have.
+    """
+    keys = scratch.keys
+    x_tables, y_tables = place.x_tables, place.y_tables
+    low_mask = place.low_mask[texture]
+    num_mips = U64(place.last_mip[texture] + 1)
+    level = ~U64(0)
+    x_start, y_start, base, width, height = U64(0), U64(0), U64(0), U64(0), U64(0)
+    count = 0
     n = U64(0)
-    single = place.last_mip[texture] == 0
-    for lane in range(len(row)):
-        texel = row[lane]
-        if texel == U32(0xFFFFFFFF):
+    for lane in range(lanes.shape[1]):
+        texel = lanes[slot, lane]
+        if texel == INACTIVE_TEXEL:
             continue
-        mip = U64(0) if single else U64(texel >> U32(28))
+        mip = U64(texel >> U32(28))
         y, x = U64((texel >> U32(14)) & U32(16383)), U64(texel & U32(16383))
-        mips[mip] += 1
-        keys[n] = _texel_sector(texture, mip, y, x, place, shift) - first
+        if mip != level:
+            # Lanes of a row mostly share their level.
+            if mip >= num_mips:
+                return -1
+            if count:
+                lane_fetches[U64(group) + level] += count
+            level, count = mip, 0
+            x_start, y_start = U64(place.x_start[texture, mip]), U64(place.y_start[texture, mip])
+            base = place.base[texture, mip]
+            width, height = U64(place.width[texture, mip]), U64(place.height[texture, mip])
+        if x >= width or y >= height:
+            return -1
+        count += 1
+        address = _address(x_tables, y_tables, x_start, y_start, base, low_mask, y, x)
+        keys[n] = (address >> shift) - first
         n += U64(1)
         if bilinear:
-            x1 = min(x + U64(1), U64(place.width[texture, mip]) - U64(1))
-            y1 = min(y + U64(1), U64(place.height[texture, mip]) - U64(1))
-            keys[n] = _texel_sector(texture, mip, y, x1, place, shift) - first
-            keys[n + U64(1)] = _texel_sector(texture, mip, y1, x, place, shift) - first
-            keys[n + U64(2)] = _texel_sector(texture, mip, y1, x1, place, shift) - first
+            x1, y1 = min(x + U64(1), width - U64(1)), min(y + U64(1), height - U64(1))
+            address = _address(x_tables, y_tables, x_start, y_start, base, low_mask, y, x1)
+            keys[n] = (address >> shift) - first
+            address = _address(x_tables, y_tables, x_start, y_start, base, low_mask, y1, x)
+            keys[n + U64(1)] = (address >> shift) - first
+            address = _address(x_tables, y_tables, x_start, y_start, base, low_mask, y1, x1)
+            keys[n + U64(2)] = (address >> shift) - first
             n += U64(3)
-    return n
+    if count:
+        lane_fetches[U64(group) + level] += count
+    return np.int64(n)
 
 
-@njit(cache=True, nogil=True, inline="always")
-def _address_sectors(row, access_bytes, shift, keys, mips):  # type: ignore[no-untyped-def]
-    """Sectors of the active lanes' byte addresses; an access over a sector's end has two. Returns how many keys."""
+@njit(cache=True, nogil=True, _nrt=False)
+def _address_sectors(lanes, slot, access_bytes, shift, scratch, lane_fetches, group):  # type: ignore[no-untyped-def]
+    """Sectors of a row's byte addresses; an access over a sector's end has two. Returns how many keys."""
+    keys = scratch.keys
     n = U64(0)
-    for lane in range(len(row)):
-        address = row[lane]
-        if address == U64(0xFFFFFFFFFFFFFFFF):
+    for lane in range(lanes.shape[1]):
+        address = U64(lanes[slot, lane])
+        if address == INACTIVE_ADDRESS:
             continue
-        mips[0] += 1
+        lane_fetches[group] += 1
         first, last = address >> shift, (address + U64(access_bytes - 1)) >> shift
         keys[n] = first
         n += U64(1)
         if last != first:
             keys[n] = last
             n += U64(1)
-    return n
+    return np.int64(n)
 
 
-@njit(cache=True, nogil=True, inline="always")
-def _sort_distinct(keys, n, ranked, weight):  # type: ignore[no-untyped-def]
+@njit(cache=True, nogil=True, _nrt=False)
+def _sort_distinct(scratch, n):  # type: ignore[no-untyped-def]
     """Each key to ranked[number of smaller keys], and how often it occurs to weight there: sorted, with gaps after repeats.
 
     Comparing all pairs is branch-free and vectorises; at 32 keys it beats a sort.
     """
-    for k in range(n):
+    keys, rank, ranked, weight = scratch.keys, scratch.rank, scratch.ranked, scratch.weight
+    # Whole vectors, and a length the compiler does not know: else it unrolls instead of vectorising.
+    padded = (n + U64(15)) & ~U64(15)
+    for k in range(n, padded):
+        keys[k] = ~keys.dtype.type(0)
+    for k in range(padded):
+        rank[k] = 0
         weight[k] = 0
+    for other in range(n):
+        key = keys[other]
+        for k in range(padded):
+            rank[k] += U32(key < keys[k])
     for k in range(n):
-        key = keys[k]
-        rank = U32(0)
-        for other in range(n):
-            rank += U32(keys[other] < key)
-        ranked[rank] = key
-        weight[rank] += U32(1)
+        ranked[rank[k]] = keys[k]
+        weight[rank[k]] += U32(1)
 
 
-@njit(cache=True, nogil=True, inline="always")
+@njit(cache=True, nogil=True, _nrt=False)
 def _store_bytes(  # type: ignore[no-untyped-def]
-    row,
-    is_texel,
-    texture,
-    access_bytes,
-    place,
-    sector_shift,
-    line_shift,
-    begin,
-    end,
-    line,
-    written,
-    bytes_written,
+    lanes, slot, texture, access_bytes, place, sector_shift, line_shift, begin, end, requests
 ):
     """OR the bytes that each lane writes into its request's byte masks."""
     sector_bytes = U64(1) << sector_shift
     granule = max(U64(1), sector_bytes // U64(32))
-    for lane in range(len(row)):
-        if is_texel:
-            texel = row[lane]
-            if texel == U32(0xFFFFFFFF):
+    sector_in_line = (U64(1) << (line_shift - sector_shift)) - U64(1)
+    for lane in range(lanes.shape[1]):
+        if texture >= 0:
+            texel = lanes[slot, lane]
+            if texel == INACTIVE_TEXEL:
                 continue
-            mip, y, x = (
-                U64(texel >> U32(28)),
+            mip = U64(texel >> U32(28))
+            address = _address(
+                place.x_tables,
+                place.y_tables,
+                U64(place.x_start[texture, mip]),
+                U64(place.y_start[texture, mip]),
+                place.base[texture, mip],
+                place.low_mask[texture],
                 U64((texel >> U32(14)) & U32(16383)),
                 U64(texel & U32(16383)),
             )
-            address = _texel_sector(texture, mip, y, x, place, U64(0))
         else:
-            address = U64(row[lane])
-            if address == U64(0xFFFFFFFFFFFFFFFF):
+            address = U64(lanes[slot, lane])
+            if address == INACTIVE_ADDRESS:
                 continue
         for byte in range(access_bytes):
             at = address + U64(byte)
             number = at >> line_shift
             for i in range(begin, end):
-                if line[i] == number:
-                    s = (at >> sector_shift) & ((U64(1) << (line_shift - sector_shift)) - U64(1))
+                if requests.line[i] == number:
+                    sector = (at >> sector_shift) & sector_in_line
                     bit = (at & (sector_bytes - U64(1))) // granule
-                    bytes_written[written[i], s] |= U32(1) << U32(bit)
+                    requests.bytes_written[requests.written[i], sector] |= U32(1) << U32(bit)
 
 
-@njit(cache=True, nogil=True)
-def coalesce(  # type: ignore[no-untyped-def]
-    slots,
-    lanes,
-    instruction,
-    program,
-    place,
-    sector_shift,
-    line_shift,
-    first_sector,
-    key_of,
-    line,
-    mask,
-    meta,
-    written,
-    bytes_written,
-    segments,
-    lane_fetches,
-):
-    """Coalesce the rows at `slots` of the store, in that order, into requests; returns (requests, stores) written.
+class Scratch(NamedTuple):
+    """Working memory of `coalesce`: room for every key of one row.
 
-    lanes: (capacity, warp_size) packed texels or addresses. first_sector: uint64 subtracted from texels' sectors so that keys of
-    `key_of`'s dtype hold them. segments: (len(slots) + 1,) int64, written; lane_fetches: (num_groups,) int64, added to.
+    keys, ranked: (k,) of the key's type; rank, weight: (k,) uint32.
     """
-    keys = np.empty(4 * lanes.shape[1], key_of.dtype)
-    ranked = np.empty_like(keys)
-    weight = np.empty(4 * lanes.shape[1], np.uint32)
-    mips = np.empty(MAX_MIPS, np.int64)
+
+    keys: npt.NDArray[np.uint32] | npt.NDArray[np.uint64]
+    rank: npt.NDArray[np.uint32]
+    ranked: npt.NDArray[np.uint32] | npt.NDArray[np.uint64]
+    weight: npt.NDArray[np.uint32]
+
+
+def new_scratch(warp_size: int, key_dtype: npt.DTypeLike) -> Scratch:
+    """Scratch for rows of `warp_size` lanes with up to four keys each."""
+    room = 4 * warp_size
+    keys, ranked = np.zeros(room, key_dtype), np.zeros(room, key_dtype)
+    return Scratch(keys, np.zeros(room, np.uint32), ranked, np.zeros(room, np.uint32))
+
+
+@njit(cache=True, nogil=True, _nrt=False)
+def coalesce(  # type: ignore[no-untyped-def]
+    slots, lanes, instruction, program, place, sector_shift, line_shift, first, scratch, requests, lane_fetches
+):
+    """Coalesce the rows at `slots` of the store, in that order, into `requests`, a segment each.
+
+    lanes: (capacity, warp_size) packed texels or addresses. first: uint64 subtracted from texels' sectors so that the scratch's
+    keys hold them. lane_fetches: (num_groups,) int64, added to. Returns -1, or the slot of a row with a texel outside its texture.
+    """
     sector_in_line = (U64(1) << (line_shift - sector_shift)) - U64(1)
     to_line = line_shift - sector_shift
-    is_texel = place.base.shape[0] > 0
+    lines, masks, metas = requests.line, requests.mask, requests.meta
+    ranked, weight = scratch.ranked, scratch.weight
     num, stores = U64(0), 0
-    segments[0] = 0
+    requests.segments[0] = 0
     for k in range(len(slots)):
         slot = slots[k]
         code = instruction[slot]
         operation = program.operation[code]
         texture, group = program.texture[code], U32(program.group[code])
-        mips[:] = 0
-        if is_texel:
-            n = _texel_sectors(
-                lanes[slot],
-                texture,
-                program.bilinear[code],
-                place,
-                sector_shift,
-                first_sector,
-                keys,
-                mips,
+        last_mip = 0
+        if texture >= 0:
+            found = _texel_sectors(
+                lanes, slot, texture, program.bilinear[code], place, sector_shift, first, scratch, lane_fetches, group
             )
+            if found < 0:
+                return slot
             last_mip = place.last_mip[texture]
         else:
-            n = _address_sectors(lanes[slot], program.access_bytes[code], sector_shift, keys, mips)
-            last_mip = 0
-        for mip in range(last_mip + 1):
-            lane_fetches[group + U32(mip)] += mips[mip]
-        _sort_distinct(keys, n, ranked, weight)
+            found = _address_sectors(
+                lanes, slot, program.access_bytes[code], sector_shift, scratch, lane_fetches, group
+            )
+        n = U64(found)
+        _sort_distinct(scratch, n)
         begin = num
         mip = 0
         at = U64(0)
         previous = U64(0)
         while at < n:
-            sector = U64(ranked[at]) + first_sector
+            sector = U64(ranked[at]) + first
             at += U64(weight[at])
             number = sector >> to_line
             bit = U8(1) << U8(sector & sector_in_line)
             if num > begin and number == previous:
-                mask[num - U64(1)] |= bit
+                masks[num - U64(1)] |= bit
                 continue
             # Mips follow each other in memory, so that the mip never falls along sorted sectors.
             while mip < last_mip and (place.base[texture, mip + 1] >> sector_shift) <= sector:
                 mip += 1
             previous = number
-            line[num], mask[num] = number, bit
-            meta[num] = (U32(operation) << U32(GROUP_BITS)) | (group + U32(mip))
+            lines[num], masks[num] = number, bit
+            metas[num] = (U32(operation) << U32(GROUP_BITS)) | (group + U32(mip))
             if operation == STORE:
-                written[num] = stores
+                requests.written[num] = stores
                 for s in range(8):
-                    bytes_written[stores, s] = 0
+                    requests.bytes_written[stores, s] = 0
                 stores += 1
             num += U64(1)
         if operation == STORE:
             _store_bytes(
-                lanes[slot],
-                is_texel,
-                texture,
-                program.access_bytes[code],
-                place,
-                sector_shift,
-                line_shift,
-                begin,
-                num,
-                line,
-                written,
-                bytes_written,
+                lanes, slot, texture, program.access_bytes[code], place, sector_shift, line_shift, begin, num, requests
             )
-        segments[k + 1] = num
-    return num, stores
+        requests.segments[k + 1] = num
+    return -1
 
 
-__all__ = [
-    "LOAD",
-    "Placement",
-    "Program",
-    "Requests",
-    "coalesce",
-    "groups_of",
-    "placement_of",
-    "program_of",
-]
+__all__ = ["Placement", "Program", "Scratch", "coalesce", "groups_of", "new_scratch", "placement_of", "program_of"]

@@ -28,11 +28,13 @@ from cachesim.address import (
     set_indices,
     slice_and_line,
 )
-from cachesim.coalesce import Placement, Program, coalesce
+from cachesim.coalesce import Placement, Program, coalesce, new_scratch
 from cachesim.config import L2, CacheLevel
 from cachesim.dispatch import IssuedRows
 from cachesim.route import pass_down
 from cachesim.stream import GROUP_BITS, STORE, Outcome, Requests
+from traces.errors import InputError
+from traces.texture import unpack_texel
 
 #: Rows of a batch: long enough that each L1 unit's state is fetched into the host's cache once for many rows.
 BATCH_ROWS = 8192
@@ -217,7 +219,7 @@ class Hierarchy:
         self._first_sector = _U64(
             texel_range[0] >> int(self._sector_shift) if narrow and texel_range else 0
         )
-        self._key_of = np.zeros(0, np.uint32 if narrow else np.uint64)
+        self._scratch = new_scratch(warp_size, np.uint32 if narrow else np.uint64)
         keys = warp_size * (4 if program.bilinear.any() else 2 if texel_range is None else 1)
         self._free: SimpleQueue[_Batch] = SimpleQueue()
         for _ in range(_NUM_BATCHES if threaded else 1):
@@ -296,7 +298,7 @@ class Hierarchy:
         buffer = batch.buffers[0]
         requests = buffer.requests
         num = len(by_unit)
-        coalesce(
+        bad_slot = coalesce(
             rows.slot[by_unit],
             rows.lanes,
             rows.instruction,
@@ -305,15 +307,12 @@ class Hierarchy:
             self._sector_shift,
             self._line_shift,
             self._first_sector,
-            self._key_of,
-            requests.line,
-            requests.mask,
-            requests.meta,
-            requests.written,
-            requests.bytes_written,
-            requests.segments,
+            self._scratch,
+            requests,
             self.lane_fetches,
         )
+        if bad_slot >= 0:
+            raise InputError(self._describe_bad_row(rows, bad_slot))
         requests.instance[:num] = rows.instance[by_unit]
         requests.order[by_unit] = np.arange(num)
         self.num_rows += num
@@ -321,6 +320,17 @@ class Hierarchy:
             segments=requests.segments[: num + 1],
             instance=requests.instance[:num],
             order=requests.order[:num],
+        )
+
+    def _describe_bad_row(self, rows: IssuedRows, slot: int) -> str:
+        texture = int(self._program.texture[rows.instruction[slot]])
+        width, height = self._placement.width[texture], self._placement.height[texture]
+        mip, y, x = (v.astype(np.int64) for v in unpack_texel(rows.lanes[slot].astype(np.uint32)))
+        outside = (x >= width[mip % len(width)]) | (y >= height[mip % len(width)])
+        lane = int(np.argmax(outside & (rows.lanes[slot] != np.uint32(0xFFFFFFFF))))
+        return (
+            f"trace: a fetch of texture {texture} asks for texel (mip {mip[lane]}, y {y[lane]}, x {x[lane]}); it has "
+            f"{int((width > 0).sum())} mips, mip 0 of {width[0]}x{height[0]} texels"
         )
 
     def _first_level(self, batch: _Batch) -> None:

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import pandas as pd
 
 from cachesim import simulate_all
+from cachesim.report import sum_parts
 from experiments.console import StageClock
 from kernels.frame import Frame, render
 from kernels.method import Method
@@ -24,10 +25,13 @@ from kernels.record import record
 if TYPE_CHECKING:
     from cachesim import Report
     from cachesim.config import Gpu
+    from cachesim.report import Part
     from kernels.device import Device
     from kernels.gbuffer import GBuffer
 
 METHODS = ("fixed", "adaptive")
+#: Of which passes a number is: of all that are traced, or of the sampling pass alone.
+PASSES = ("all", "sampling")
 REFERENCE_SAMPLES = 1024
 #: The texture that the mip levels belong to: irradiance and depth, which the sampling pass reads.
 MIPPED_TEXTURE = "setup"
@@ -40,7 +44,8 @@ PAPER_TIME_RATIO = {"close": 0.140, "ear": 0.280, "front": 0.262}
 class SceneResult:
     """One scene, both methods.
 
-    label: the scene's name in tables. frames, psnr_db, reports: by method; reports one per GPU.
+    label: the scene's name in tables. frames, psnr_db, reports: by method; reports one per GPU;
+    psnr_db["accumulated"] is of adaptive's frames blended over time.
     """
 
     label: str
@@ -90,6 +95,8 @@ def compare(
             frame = render(gbuffer, chosen, num_frames=count, device=device)
         frames[kind] = frame
         qualities[kind] = psnr(frame.combined, reference, gbuffer.subsurface)
+        if chosen.adaptive:
+            qualities["accumulated"] = psnr(frame.accumulated, reference, gbuffer.subsurface)
         with stage(f"recording and counting {kind}"):
             trace = record(gbuffer, chosen, num_frames=count, device=device)
             reports[kind] = simulate_all(trace, gpus)
@@ -117,6 +124,7 @@ def quality_frame(results: Sequence[SceneResult]) -> pd.DataFrame:
                 "paper_time_ratio": PAPER_TIME_RATIO.get(result.label),
                 "psnr_fixed_db": result.psnr_db["fixed"],
                 "psnr_adaptive_db": result.psnr_db["adaptive"],
+                "psnr_accumulated_db": result.psnr_db["accumulated"],
                 "paper_psnr_adaptive_db": PAPER_PSNR_DB.get(result.label),
             }
         )
@@ -124,33 +132,38 @@ def quality_frame(results: Sequence[SceneResult]) -> pd.DataFrame:
 
 
 def demand_frame(results: Sequence[SceneResult]) -> pd.DataFrame:
-    """One row per scene, GPU and method: lane fetches, demand in bytes, and miss rates.
+    """One row per scene, GPU, passes ("all" or "sampling") and method.
 
-    Columns of levels that a GPU lacks are empty.
+    Lane fetches, demand in bytes, miss rates; columns of levels that a GPU lacks are empty.
     """
     rows = []
     for result in results:
-        for method in METHODS:
-            for report in result.reports[method]:
-                row: dict[str, Any] = {
-                    "scene": result.label,
-                    "gpu": report.gpu,
-                    "method": method,
-                    **report.demand,
-                }
-                for level in report.levels:
-                    row[f"{level}_miss_rate"] = report.counters[level].miss_rate
-                rows.append(row)
-    frame = pd.DataFrame(rows)
-    order = {name: i for i, name in enumerate(dict.fromkeys(frame["gpu"]))}
-    scenes = {name: i for i, name in enumerate(dict.fromkeys(frame["scene"]))}
-    keys = frame["scene"].map(scenes) * len(order) + frame["gpu"].map(order)
-    return frame.iloc[keys.argsort(kind="stable")].reset_index(drop=True)
+        for gpu in range(len(result.reports["fixed"])):
+            for passes in PASSES:
+                for method in METHODS:
+                    report = result.reports[method][gpu]
+                    key = {"scene": result.label, "gpu": report.gpu}
+                    key |= {"passes": passes, "method": method}
+                    rows.append(key | _totals(report, passes))
+    return pd.DataFrame(rows)
+
+
+def _totals(report: Report, passes: str) -> dict[str, Any]:
+    """Lane fetches, bytes and miss rates of the whole frame, or of its sampling pass."""
+    if passes == "all":
+        counters, row = report.counters, dict[str, Any](report.demand)
+    else:
+        parts = [p for p in report.parts or () if p.pass_name == passes]
+        counters = {level: sum_parts(parts, level) for level in report.levels}
+        row = {"lane_fetches": sum(p.lane_fetches for p in parts)}
+        row |= {f"{n}_bytes": c.presented * c.sector_bytes for n, c in counters.items()}
+        row["dram_bytes"] = sum(p.dram.bytes for p in parts)
+    return row | {f"{name}_miss_rate": c.miss_rate for name, c in counters.items()}
 
 
 def ratio_frame(demand: pd.DataFrame) -> pd.DataFrame:
-    """Adaptive / fixed of every number of `demand_frame`: one row per scene and GPU."""
-    keys = ["scene", "gpu"]
+    """Adaptive / fixed of every number of `demand_frame`: one row per scene, GPU and passes."""
+    keys = ["scene", "gpu", "passes"]
     fixed, adaptive = (
         demand[demand["method"] == m].drop(columns="method").set_index(keys) for m in METHODS
     )
@@ -162,28 +175,28 @@ def mip_frame(results: Sequence[SceneResult]) -> pd.DataFrame:
 
     A part is one mip of the irradiance texture, or all other textures together ("other").
     """
-    rows = []
-    for result in results:
-        for method in METHODS:
-            for report in result.reports[method]:
-                for part in report.parts or ():
-                    is_mipped = part.texture == MIPPED_TEXTURE
-                    row = {
-                        "scene": result.label,
-                        "gpu": report.gpu,
-                        "method": method,
-                        "part": f"mip {part.mip}" if is_mipped else "other",
-                        "lane_fetches": part.lane_fetches,
-                        "dram_bytes": part.dram.bytes,
-                    }
-                    for level in ("l1", "l2"):
-                        counts = part.counters[level]
-                        row[f"{level}_accesses"] = counts.accesses
-                        row[f"{level}_misses"] = counts.misses
-                        row[f"{level}_bytes"] = counts.presented * counts.sector_bytes
-                    rows.append(row)
+    rows = [
+        _part_row(result.label, report, method, part)
+        for result in results
+        for gpu in range(len(result.reports["fixed"]))
+        for method in METHODS
+        for report in [result.reports[method][gpu]]
+        for part in report.parts or ()
+    ]
     keys = ["scene", "gpu", "method", "part"]
     frame = pd.DataFrame(rows).groupby(keys, sort=False).sum().reset_index()
     for level in ("l1", "l2"):
         frame[f"{level}_miss_rate"] = frame[f"{level}_misses"] / frame[f"{level}_accesses"]
     return frame
+
+
+def _part_row(label: str, report: Report, method: str, part: Part) -> dict[str, Any]:
+    name = f"mip {part.mip}" if part.texture == MIPPED_TEXTURE else "other"
+    row: dict[str, Any] = {"scene": label, "gpu": report.gpu, "method": method, "part": name}
+    row |= {"lane_fetches": part.lane_fetches, "dram_bytes": part.dram.bytes}
+    for level in ("l1", "l2"):
+        counts = part.counters[level]
+        row[f"{level}_accesses"] = counts.accesses
+        row[f"{level}_misses"] = counts.misses
+        row[f"{level}_bytes"] = counts.presented * counts.sector_bytes
+    return row

@@ -30,7 +30,8 @@ def command(
     quick: Annotated[bool, typer.Option("--quick", help="Small frames: a smoke test.")] = False,
     device: DeviceName = None,
     output: Annotated[
-        Path | None, typer.Option("-o", "--output", metavar="STEM", help="Also STEM.csv, .md, .tex.")
+        Path | None,
+        typer.Option("-o", "--output", metavar="STEM", help="Also STEM.csv, .md, .tex."),
     ] = None,
 ) -> None:
     """Measure counting speed, the pipeline's time and peak memory, and the file's bytes."""
@@ -120,10 +121,13 @@ def figures_table(frame: pd.DataFrame) -> Table:
     )
     notes = (
         machine_line(),
-        f"stream: L1 and L2 counting on {GPU} of a coalesced stream in memory, one thread, set-up and "
-        "coalescing excluded, all planes. pipeline: rendered, recorded and counted with no file between; "
+        f"stream: L1 and L2 counting on {GPU} of a coalesced stream in memory, one thread, "
+        "set-up and "
+        "coalescing excluded, all planes. pipeline: rendered, recorded and counted with no file "
+        "between; "
         "peak of the whole process. file: Parquet with full provenance.",
-        "Asked: stream close 40, front 60; pipeline close fixed 1920x1080 30 s and 2 GiB; file 1.8 B "
+        "Asked: stream close 40, front 60; pipeline close fixed 1920x1080 30 s and 2 GiB; file "
+        "1.8 B "
         "in the worst scene, 1.0 where a mm is under 10 pixels.",
     )
     return Table("Speed and memory", frame, columns, notes)
@@ -138,5 +142,5 @@ def stages_table(frame: pd.DataFrame) -> Table:
         Column("stage", "stage"),
         Column("seconds", "s", ".2f"),
     )
-    note = "Stages of a pipeline run side by side: their seconds overlap and include waiting for the GIL."
+    note = "Stages of a pipeline run side by side: their seconds overlap."
     return Table("Time per stage", frame, columns, (note,))

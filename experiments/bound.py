@@ -19,7 +19,7 @@ def command(
     fetch_path: FetchPathName = None,
     layout: LayoutName = None,
 ) -> None:
-    """Line misses of one level under its own policy and under Belady's OPT, which no policy can beat."""
+    """Line misses of a level under its own policy, and under Belady's OPT, which none can beat."""
     import pandas as pd
 
     from experiments.console import progress

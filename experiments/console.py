@@ -1,4 +1,4 @@
-"""What commands print: results on stdout, progress and remarks on stderr, and how long each stage took."""
+"""What commands print: results on stdout, progress, remarks and times on stderr."""
 
 from __future__ import annotations
 

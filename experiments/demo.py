@@ -1,9 +1,10 @@
-"""`cachesim demo`: fixed against adaptive on three scenes and three GPUs, as tables and pictures."""
+"""`cachesim demo`: fixed against adaptive per scene and GPU, in tables and pictures."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -12,13 +13,14 @@ from experiments.options import AlbedoMap, DeviceName, Folder, NormalMap, parse_
 if TYPE_CHECKING:
     from cachesim.config import Gpu
     from experiments.adaptive_vs_fixed import SceneResult
-    from kernels.device import Device
+    from kernels.gbuffer import GBuffer
 
 SCENES = "close,ear,front"
 GPUS = "titan-x-pascal,rtx-2080-ti,rx-5700-xt"
 SIZE, FULL_SIZE = "960x540", "1920x1080"
-#: Seconds per megapixel and scene that scatters everywhere, counted on three GPUs, two cores.
-SECONDS_PER_MEGAPIXEL = 50.0
+#: Measured on two cores: seconds of a first run whatever its size, and per million scattering
+#: pixels for rendering, and for counting on each GPU.
+FIRST_S, RENDER_S, COUNT_S = 30.0, 30.0, 10.0
 MESH_HELP = "A mesh instead of the procedural head; --scenes then names cameras."
 
 
@@ -28,7 +30,9 @@ def command(
         str | None, typer.Option("--size", metavar="WxH", help=f"Frame size; {SIZE} unless given.")
     ] = None,
     scenes: Annotated[str, typer.Option("--scenes", metavar="LIST", help="Scenes.")] = SCENES,
-    gpus: Annotated[str, typer.Option("--gpus", metavar="LIST", help="Presets or TOML files.")] = GPUS,
+    gpus: Annotated[
+        str, typer.Option("--gpus", metavar="LIST", help="Presets or TOML files.")
+    ] = GPUS,
     mesh: Annotated[Path | None, typer.Option("--mesh", metavar="FILE", help=MESH_HELP)] = None,
     albedo_map: AlbedoMap = None,
     normal_map: NormalMap = None,
@@ -38,7 +42,7 @@ def command(
     device: DeviceName = None,
     output: Folder = Path("out"),
 ) -> None:
-    """Compare fixed with adaptive sampling: demand and miss rates per scene and GPU, and pictures."""
+    """Compare fixed with adaptive sampling: demand and miss rates, tables, pictures."""
     from experiments.console import StageClock, progress, remark
     from experiments.options import parse_image_size, scene_arguments
     from experiments.output import input_file, output_folder
@@ -51,30 +55,35 @@ def command(
     scene_names = parse_names(scenes, "--scenes")
     if mesh is not None:
         input_file(mesh)
-    map_options = scene_arguments(str(mesh or scene_names[0]), None, albedo_map, normal_map)
+    maps = scene_arguments(str(mesh or scene_names[0]), None, albedo_map, normal_map)
     from cachesim import presets
 
     machines = [presets.load(name) for name in parse_names(gpus, "--gpus")]
     with clock.stage("loading the libraries"):
         from experiments import adaptive_vs_fixed as study
         from kernels.device import open_device
+        from kernels.scene import load_scene
+
+    def of_mesh(name: str) -> dict[str, Any]:
+        return {} if mesh is None else maps | {"camera": name}
+
     folder = output_folder(output)
     opened = open_device(device)
-    remark(
-        f"{width}x{height} on {opened.name}: about {estimate_s(width, height, len(scene_names)):,.0f} s "
-        "on two cores"
-    )
+    with progress("rendering the scenes"), clock.stage("scenes"):
+        gbuffers = {
+            name: load_scene(str(mesh or name), width, height, device=opened, **of_mesh(name))
+            for name in scene_names
+        }
+    seconds = estimate_s(list(gbuffers.values()), len(machines))
+    remark(f"{width}x{height} on {opened.name}: about {seconds:,.0f} s on two cores")
     results: list[SceneResult] = []
-    with progress("starting", 1 + 5 * len(scene_names)) as bar:
+    with progress("starting", 5 * len(scene_names)) as bar:
 
         def step(text: str) -> None:
-            bar.advance()
             bar.describe(text)
+            bar.advance()
 
-        for name in scene_names:
-            step(f"{name}: scene")
-            with clock.stage("scene"):
-                gbuffer = _load(name, mesh, width, height, opened, map_options)
+        for name, gbuffer in gbuffers.items():
             results.append(
                 study.compare(
                     name,
@@ -92,17 +101,10 @@ def command(
         remark(line)
 
 
-def estimate_s(width: int, height: int, num_scenes: int) -> float:
-    """Seconds on two cores; the first run's compilation is in it."""
-    return 30 + width * height / 1e6 * num_scenes * SECONDS_PER_MEGAPIXEL * 0.7
-
-
-def _load(name, mesh, width, height, device, map_options):  # type: ignore[no-untyped-def]
-    from kernels.scene import load_scene
-
-    if mesh is None:
-        return load_scene(name, width, height, device=device)
-    return load_scene(str(mesh), width, height, camera=name, device=device, **map_options)
+def estimate_s(gbuffers: Sequence[GBuffer], num_gpus: int) -> float:
+    """Seconds on two cores, first compilation included."""
+    megapixels = sum(float(g.subsurface.sum()) for g in gbuffers) / 1e6
+    return FIRST_S + megapixels * (RENDER_S + num_gpus * COUNT_S)
 
 
 def write_results(
@@ -139,11 +141,14 @@ def write_results(
         save_png(folder / f"{result.label}-unscattered.png", preview(result.gbuffer))
         for method, frame in result.frames.items():
             save_png(folder / f"{result.label}-{method}.png", tone_map(frame.combined))
-            title = f"{result.label}, {method}, frame {frame.index}"
-            figure = plots.count_map(frame.counts, title, attribution)
-            write_figure(folder / f"{result.label}-{method}-counts.png", figure)
-    megabytes = demand.assign(
-        **{name.replace("bytes", "mb"): demand[name] / 1e6 for name in tables.DEMAND_NAMES}
+        adaptive = result.frames["adaptive"]
+        save_png(folder / f"{result.label}-adaptive-blended.png", tone_map(adaptive.accumulated))
+        title = f"{result.label}, adaptive, frame {adaptive.index}"
+        figure = plots.count_map(adaptive.counts, title, attribution)
+        write_figure(folder / f"{result.label}-adaptive-counts.png", figure)
+    whole = demand[demand["passes"] == "all"]
+    megabytes = whole.assign(
+        **{name.replace("bytes", "mb"): whole[name] / 1e6 for name in tables.DEMAND_NAMES}
     )
     demand_labels = {
         "l1_mb": "L1 demand (MB)",
@@ -152,8 +157,8 @@ def write_results(
     }
     rate_labels = {"l1_miss_rate": "L1 miss rate", "l2_miss_rate": "L2 miss rate"}
     figures = {
-        "demand": plots.comparison_figure(megabytes, demand_labels, ",.0f"),
-        "miss-rates": plots.comparison_figure(demand, rate_labels, ".2f"),
+        "demand": plots.comparison_figure(megabytes, demand_labels),
+        "miss-rates": plots.comparison_figure(whole, rate_labels),
         "mips": plots.mip_figure(
             tables.bar_frames(mips, machines[0].name), f"L1 demand on {machines[0].name} (MB)"
         ),

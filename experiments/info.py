@@ -1,4 +1,4 @@
-"""`cachesim info`: what a trace holds: manifest, size, and lane fetches per pass, texture and mip."""
+"""`cachesim info`: a trace's manifest, its size, its lane fetches per pass, texture and mip."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where commands read and write: paths checked before the work, results written whole or not at all."""
+"""Where commands read and write: paths checked before the work, results whole or not at all."""
 
 from __future__ import annotations
 

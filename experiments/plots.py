@@ -6,7 +6,7 @@ hatching, lines in marker and dash. No pyplot: a figure belongs to whoever holds
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
@@ -15,6 +15,8 @@ import numpy.typing as npt
 from matplotlib.axes import Axes
 from matplotlib.colors import BoundaryNorm
 from matplotlib.figure import Figure
+
+from experiments.tables import three_digits
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -71,9 +73,9 @@ def _style(axes: Axes) -> None:
 
 
 def _paired_bars(
-    axes: Axes, labels: Sequence[str], values: dict[str, Sequence[float]], digits: str = ""
+    axes: Axes, labels: Sequence[str], values: Mapping[str, Sequence[float]], numbers: bool = False
 ) -> None:
-    """One group of bars per label, one bar per method; `digits` formats the number above a bar."""
+    """One group of bars per label, one bar per method; `numbers` puts its value above each."""
     place = np.arange(len(labels))
     width = 0.8 / len(values)
     for i, (method, heights) in enumerate(values.items()):
@@ -82,10 +84,10 @@ def _paired_bars(
         bars = axes.bar(
             at, heights, width, label=method, color=colour, hatch=hatch, edgecolor="white"
         )
-        if digits:
+        if numbers:
             axes.bar_label(
                 bars,
-                [format(h, digits) for h in heights],
+                [three_digits(h) for h in heights],
                 fontsize=FONT_SIZE - 3,
                 padding=1,
             )
@@ -93,11 +95,11 @@ def _paired_bars(
     _style(axes)
 
 
-def comparison_figure(frame: pd.DataFrame, quantities: dict[str, str], digits: str) -> Figure:
+def comparison_figure(frame: pd.DataFrame, quantities: dict[str, str]) -> Figure:
     """Fixed beside adaptive: axes in rows of GPUs and columns of quantities, bars grouped by scene.
 
     frame: columns "scene", "gpu", "method" and the quantities. quantities: column to axis label
-    with its unit. digits: format of the numbers above the bars.
+    with its unit.
     """
     gpus = list(dict.fromkeys(frame["gpu"]))
     scenes = list(dict.fromkeys(frame["scene"]))
@@ -110,7 +112,7 @@ def comparison_figure(frame: pd.DataFrame, quantities: dict[str, str], digits: s
         of_gpu = frame[frame["gpu"] == gpu].set_index(["scene", "method"])
         for axes, (column, label) in zip(row, quantities.items(), strict=True):
             heights = {m: [float(of_gpu.loc[(s, m), column]) for s in scenes] for m in methods}
-            _paired_bars(axes, scenes, heights, digits)
+            _paired_bars(axes, scenes, heights, numbers=True)
             axes.margins(y=0.14)
             if gpu == gpus[0]:
                 axes.set_title(label, fontsize=FONT_SIZE)

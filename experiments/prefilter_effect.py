@@ -8,7 +8,6 @@ comes from the level that a sample reads.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
 from itertools import product
 from typing import TYPE_CHECKING, Any
 
@@ -111,7 +110,10 @@ def effect_table(frame: pd.DataFrame, gpu: str, size: str) -> Table:
         Column("dram_mb_eq", "DRAM MB Eq 5.12", ",.1f"),
     )
     return Table(
-        f"Pre-filtering and misses: sampling pass, {gpu}, {size}", frame, columns, tuple(explain(frame))
+        f"Pre-filtering and misses: sampling pass, {gpu}, {size}",
+        frame,
+        columns,
+        tuple(explain(frame)),
     )
 
 
@@ -120,12 +122,17 @@ def explain(frame: pd.DataFrame) -> list[str]:
     change = frame["l1_eq"] - frame["l1_mip0"]
     best, worst = frame.loc[change.idxmin()], frame.loc[change.idxmax()]
     lines = [
-        "Eq 5.12 chooses a coarser level the wider the scatter is in pixels and the fewer the samples "
-        "(half a level per halving of the count), and only for the irradiance texture: normals and "
-        "profile ids are read at full size whatever the level. So the gain is large where a mm is many "
-        "pixels (close, legacy scale) with few samples on irradiance alone, and shrinks when the other "
+        "Eq 5.12 chooses a coarser level the wider the scatter is in pixels and the fewer the "
+        "samples "
+        "(half a level per halving of the count), and only for the irradiance texture: normals "
+        "and "
+        "profile ids are read at full size whatever the level. So the gain is large where a mm "
+        "is many "
+        "pixels (close, legacy scale) with few samples on irradiance alone, and shrinks when the "
+        "other "
         "planes, which do not change, are counted with it.",
-        "Where nearly every sample reads mip 0, the rule costs a little instead: the few coarse fetches "
+        "Where nearly every sample reads mip 0, the rule costs a little instead: the few coarse "
+        "fetches "
         "bring a second level's lines into the cache beside mip 0's.",
         f"Largest fall of the L1 miss rate: {_case(best)}; "
         + (
@@ -133,8 +140,10 @@ def explain(frame: pd.DataFrame) -> list[str]:
             if change.max() > 0
             else f"smallest fall: {_case(worst)}."
         ),
-        "The paper credits pre-filtering with 22x between the unaccelerated fixed baseline and fixed with "
-        "mips (253.18 ms against 11.47 ms, close). DRAM traffic alone does not explain that here: its "
+        "The paper credits pre-filtering with 22x between the unaccelerated fixed baseline and "
+        "fixed with "
+        "mips (253.18 ms against 11.47 ms, close). DRAM traffic alone does not explain that "
+        "here: its "
         f"largest factor, mip 0 over Eq 5.12, is {_largest_factor(frame):.1f}.",
     ]
     return lines

@@ -106,7 +106,8 @@ def command(
     num_lanes = estimate_rows(gbuffer, chosen, num_traced) * 32
     low, high = (num_lanes * b / 1e6 for b in FILE_BYTES_PER_LANE)
     remark(
-        f"{gbuffer.name} {width}x{height} on {opened.name}: up to {num_lanes / 1e6:,.1f} million lane fetches, "
+        f"{gbuffer.name} {width}x{height} on {opened.name}: up to {num_lanes / 1e6:,.1f} million "
+        "lane fetches, "
         f"about {low:,.1f} to {high:,.1f} MB"
     )
     trace = record_trace(
@@ -145,7 +146,8 @@ def parse_traced_frames(text: str, num_frames: int) -> str | tuple[int, ...]:
     for number in numbers:
         if not number.isdecimal() or int(number) >= num_frames:
             raise InputError(
-                f"--traced-frames {text!r}: frame {number!r}: allowed are last, all, or numbers from 0 "
+                f"--traced-frames {text!r}: frame {number!r}: allowed are last, all, or numbers "
+                "from 0 "
                 f"to {num_frames - 1}"
             )
     return tuple(sorted(int(number) for number in numbers))

@@ -1,4 +1,4 @@
-"""`cachesim render`: pictures of a scene without scattering, with it, and of where the samples go."""
+"""`cachesim render`: a scene without scattering, with it, and where the samples go."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def command(
     inverse_cdf: options.InverseCdf = "approximate",
     weights: options.Weights = "self-normalised",
 ) -> None:
-    """Render a scene: a preview without scattering, the scattered picture, and the map of sample counts."""
+    """Render a scene: without scattering, with it, and the map of sample counts."""
     from experiments.console import progress, remark
     from experiments.options import parse_image_size, scene_arguments
     from experiments.output import output_folder, write_figure
@@ -76,10 +76,12 @@ def command(
     save_png(folder / f"{stem}-{method}.png", tone_map(frame.combined))
     figure = count_map(frame.counts, f"{gbuffer.name}, frame {frame.index}", gbuffer.attribution)
     write_figure(folder / f"{stem}-{method}-counts.png", figure)
+    mean = frame.num_samples / int(gbuffer.subsurface.sum())
     for line in (
-        f"{gbuffer.name} {width}x{height} on {opened.name}: coverage {gbuffer.coverage_rate:.1%}, "
+        f"{gbuffer.name} {width}x{height} on {opened.name}: coverage "
+        f"{gbuffer.coverage_rate:.1%}, "
         f"{gbuffer.pixels_per_mm():.2f} pixels per mm, "
-        f"{frame.num_samples / max(int(gbuffer.subsurface.sum()), 1):.1f} samples per pixel in frame {frame.index}",
+        f"{mean:.1f} samples per pixel in frame {frame.index}",
         gbuffer.attribution,
         f"wrote {stem}-preview.png, {stem}-{method}.png and {stem}-{method}-counts.png to {folder}",
     ):

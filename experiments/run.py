@@ -88,10 +88,12 @@ def level_table(report: Report) -> Table:
     )
     demand, dram = report.demand, report.dram
     levels = ", ".join(
-        f"{name.upper()} {demand[f'{name}_bytes'] / 1e6:,.1f} MB" for name in (*report.levels, "dram")
+        f"{name.upper()} {demand[f'{name}_bytes'] / 1e6:,.1f} MB"
+        for name in (*report.levels, "dram")
     )
     notes = (
-        f"{report.lane_fetches:,} lane fetches of {report.num_rows:,} warp instructions; fetch path "
+        f"{report.lane_fetches:,} lane fetches of {report.num_rows:,} warp instructions; fetch "
+        "path "
         f"{report.fetch_path}, layout {report.layout or 'none (byte addresses)'}.",
         f"Demand: {levels} ({dram.sectors_read:,} sectors of {dram.sector_bytes} B read, "
         f"{dram.sectors_written:,} written).",
@@ -122,7 +124,7 @@ def by_table(report: Report) -> Table:
 
 
 def by_wide(report: Report) -> pd.DataFrame:
-    """One row per pass, texture and mip: lane fetches (M), demand (MB) and miss rate of each level."""
+    """One row per pass, texture and mip: lane fetches (M), demand (MB), miss rates."""
     import pandas as pd
 
     rows = []

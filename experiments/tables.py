@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from textwrap import wrap
 from typing import TYPE_CHECKING, Any
 
 from experiments.console import console
@@ -81,6 +82,13 @@ def show_value(value: Any, specification: str = "") -> str:
     return f"{int(value):,}"
 
 
+def three_digits(value: float) -> str:
+    """A number to three digits and at most two decimals: "1,234", "17.3", "0.95"."""
+    return (
+        f"{value:,.0f}" if value >= 99.95 else f"{value:.1f}" if value >= 9.995 else f"{value:.2f}"
+    )
+
+
 def cells(table: Table) -> list[list[str]]:
     """The shown cells, row by row."""
     shown = [[show_value(_scalar(v), c.format) for v in table.frame[c.name]] for c in table.columns]
@@ -115,13 +123,11 @@ def print_table(table: Table) -> None:
         collapse_padding=True,
         pad_edge=False,
     )
-    for i, column in enumerate(table.columns):
-        # Headings and long text may wrap; a number in two lines would be two numbers.
-        longest = max((len(row[i]) for row in shown), default=0)
+    for column, heading in zip(table.columns, _headings(table, shown, out.width), strict=True):
         made.add_column(
-            column.heading,
+            heading,
             justify="right" if _is_number(table, column) else "left",
-            min_width=None if column.wraps else longest,
+            no_wrap=not column.wraps,
         )
     num_words = next(
         (i for i, c in enumerate(table.columns) if _is_number(table, c)), len(table.columns)
@@ -135,6 +141,22 @@ def print_table(table: Table) -> None:
         out.print(note, markup=False)
     if table.notes:
         out.print()
+
+
+def _headings(table: Table, shown: list[list[str]], width: int) -> list[str]:
+    """The headings, in several lines where the table would be wider than the console.
+
+    Only headings and long text may take several lines; a number in two lines would be two numbers.
+    """
+    words = [c.heading for c in table.columns]
+    longest = [max((len(row[i]) for row in shown), default=0) for i in range(len(words))]
+    full = sum(max(n, len(w)) for n, w in zip(longest, words, strict=True)) + 2 * len(words)
+    if full <= width or any(c.wraps for c in table.columns):
+        return words
+    return [
+        "\n".join(wrap(w, max(n, *map(len, w.split())), break_on_hyphens=False))
+        for n, w in zip(longest, words, strict=True)
+    ]
 
 
 def _blank_repeats(row: list[str], previous: list[str], num_columns: int) -> list[str]:
@@ -200,7 +222,11 @@ def write_table(table: Table, stem: Path, data: pd.DataFrame | None = None) -> l
 
     data: what the CSV holds where it is not the shown frame.
     """
-    texts = {".csv": csv(table.frame if data is None else data), ".md": markdown(table), ".tex": latex(table)}
+    texts = {
+        ".csv": csv(table.frame if data is None else data),
+        ".md": markdown(table),
+        ".tex": latex(table),
+    }
     paths = [stem.with_name(stem.name + suffix) for suffix in texts]
     for path, text in zip(paths, texts.values(), strict=True):
         write_text(path, text)

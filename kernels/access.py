@@ -1,7 +1,7 @@
 """The access instructions of each pass, and which row of a trace each execution of one gets.
 
-A warp's rows are its pass's accesses in program order: those before the sample loop, the loop's once per step, those after it.
-A row's place therefore follows from the warp's state and step alone.
+A warp's rows are its pass's accesses in program order: those before the sample loop, the loop's
+once per step, those after it. A row's place therefore follows from the warp's state and step alone.
 """
 
 from __future__ import annotations
@@ -24,8 +24,10 @@ Offsets = npt.NDArray[np.int64]
 class Access:
     """One access instruction of a pass's kernel.
 
-    texture: name. subsurface_only: executed by warps with a scattering lane, for those lanes; else by every lane in the frame.
-    in_loop: executed once per sample; implies subsurface_only. arithmetic, num_outstanding: as in `Instruction`.
+    texture: name. subsurface_only: executed by warps with a scattering lane, for those lanes; else
+        by every lane in the frame.
+    in_loop: executed once per sample; implies subsurface_only. arithmetic, num_outstanding: as in
+        `Instruction`.
     """
 
     texture: str
@@ -39,7 +41,9 @@ class Access:
 
 @dataclass(frozen=True)
 class Program:
-    """One pass as a list of accesses; the loop's stand together. first_instruction: index of the first in the trace."""
+    """One pass as a list of accesses; the loop's stand together. first_instruction: index of the
+    first in the trace.
+    """
 
     pass_name: str
     accesses: tuple[Access, ...]
@@ -72,8 +76,12 @@ class Program:
         rows[states == OUTSIDE] = 0
         return np.concatenate([[0], np.cumsum(rows)])
 
-    def _rows_outside_loop(self, states: States, offsets: Offsets) -> list[tuple[int, Offsets, Offsets]]:
-        """(access, warps, rows) of each access outside the loop: which warps execute it, and in which rows."""
+    def _rows_outside_loop(
+        self, states: States, offsets: Offsets
+    ) -> list[tuple[int, Offsets, Offsets]]:
+        """(access, warps, rows) of each access outside the loop: which warps execute it, and in
+        which rows.
+        """
         loop, before, found = self._loop, np.zeros(len(states), np.int64), []
         for i, access in enumerate(self.accesses):
             if access.in_loop:
@@ -91,11 +99,14 @@ class Program:
         return self._loop[0] if self._loop else 0
 
     def row_instructions(self, states: States, offsets: Offsets) -> npt.NDArray[np.uint16]:
-        """(num_rows,) uint16: the instruction of each row of these warps; `offsets` from `row_offsets`."""
+        """(num_rows,) uint16: the instruction of each row of these warps; `offsets` from
+        `row_offsets`.
+        """
         loop = self._loop
         rows = np.empty(int(offsets[-1]), np.uint16)
         if loop:
-            # The loop's pattern in every row, counted from each warp's first turn; the others overwrite theirs.
+            # The loop's pattern in every row, counted from each warp's first turn; the others
+            # overwrite theirs.
             phase = ((offsets[:-1] + self._loop_start()) % len(loop)).astype(np.int64)
             turn = (np.arange(len(rows)) - np.repeat(phase, np.diff(offsets))) % len(loop)
             rows[:] = turn + (loop[0] + self.first_instruction)
@@ -108,7 +119,8 @@ class Program:
     ) -> tuple[Offsets, npt.NDArray[np.uint32]]:
         """The rows of a whole launch from each access's texels, for the references.
 
-        texels: per access, (num_warps, 32), or (num_steps, num_warps, 32) for the loop's; rows that no warp executes are dropped.
+        texels: per access, (num_warps, 32), or (num_steps, num_warps, 32) for the loop's; rows that
+            no warp executes are dropped.
         """
         offsets = self.row_offsets(states)
         lanes = np.full((int(offsets[-1]), WARP_SIZE), INACTIVE_TEXEL, np.uint32)

@@ -38,12 +38,16 @@ class Camera:
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.projection_x) and self.projection_x > 0):
-            raise InputError(f"camera {self.name}: projection_x {self.projection_x}: must be positive")
+            raise InputError(
+                f"camera {self.name}: projection_x {self.projection_x}: must be positive"
+            )
         if not np.isfinite([*self.position, *self.target, *self.up]).all():
             raise InputError(f"camera {self.name}: position, target and up must be finite numbers")
         forward = np.subtract(self.target, self.position)
         if not np.cross(forward, self.up).any():
-            raise InputError(f"camera {self.name}: cannot look from {self.position} at {self.target}")
+            raise InputError(
+                f"camera {self.name}: cannot look from {self.position} at {self.target}"
+            )
 
     def basis(self) -> tuple[npt.NDArray[np.float64], ...]:
         """Right, up and forward: unit vectors, each (3,).
@@ -60,9 +64,13 @@ class Camera:
 CAMERAS: dict[str, Camera] = {
     camera.name: camera
     for camera in (
-        Camera("close", (-7.5, -5.0, 24.0), (-2.2, -4.0, 8.4), coverage_rate=1.0, pixels_per_mm=18.0),
+        Camera(
+            "close", (-7.5, -5.0, 24.0), (-2.2, -4.0, 8.4), coverage_rate=1.0, pixels_per_mm=18.0
+        ),
         Camera("ear", (27.0, 1.0, 4.0), (6.8, -1.7, -1.1), coverage_rate=0.9, pixels_per_mm=18.0),
-        Camera("front", (0.0, -2.0, 140.0), (0.0, -3.5, 0.0), coverage_rate=0.13, pixels_per_mm=2.7),
+        Camera(
+            "front", (0.0, -2.0, 140.0), (0.0, -3.5, 0.0), coverage_rate=0.13, pixels_per_mm=2.7
+        ),
         Camera("side", (104.0, -2.0, 1.0), (0.0, -2.0, 0.0), coverage_rate=0.3, pixels_per_mm=4.2),
     )
 }

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -13,26 +13,36 @@ from kernels.grid import Grid
 from kernels.method import Method
 from kernels.setup import texels
 
+if TYPE_CHECKING:
+    from kernels.pipeline import Pipeline
+
 
 def result_name(method: Method) -> str:
     """The texture that holds the scattered light: the update pass writes a second one."""
     return "resolved" if method.adaptive else "scattered"
 
 
-def accesses(method: Method) -> tuple[Access, ...]:
+def accesses(method: Method, frame: int) -> tuple[Access, ...]:
     """The pass's accesses; arithmetic counts are assumed, from reading the kernel."""
     return (
         Access("profile_id", arithmetic=(("int", 12),)),
         Access("scene_colour"),
-        Access(result_name(method), subsurface_only=True, arithmetic=(("int", 2),), num_outstanding=1),
+        Access(
+            result_name(method), subsurface_only=True, arithmetic=(("int", 2),), num_outstanding=1
+        ),
         Access("albedo", subsurface_only=True),
         Access("output", "store", arithmetic=(("fp32", 4), ("int", 4)), num_outstanding=0),
     )
 
 
-def reference(
-    grid: Grid, textures: dict[str, Any], method: Method
-) -> list[npt.NDArray[np.uint32]]:
+def arguments(pipeline: Pipeline, level: int, frame: int) -> list[Any]:
+    """The kernel's arguments between the warp's and the trace's."""
+    result = result_name(pipeline.method)
+    names = ("scene_colour", "profile_id", result, "albedo", "output")
+    return [pipeline.buffers[name] for name in names]
+
+
+def reference(grid: Grid, textures: dict[str, Any], method: Method) -> list[npt.NDArray[np.uint32]]:
     """Write `output`; the texels of each access."""
     mask = textures["profile_id"] > 0
     colour = textures["scene_colour"].astype(np.float32)

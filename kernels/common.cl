@@ -1,7 +1,9 @@
-// What every pass shares: the lane's pixel, the texel stores of the half-float textures, and the trace rows.
+// What every pass shares: the lane's pixel, the texel stores of the half-float textures, and the
+// trace rows.
 //
-// One work group of 32 work-items is one warp; two warps are the 8x8 tile of one CTA. warp_steps holds, per warp, -1 where
-// all lanes lie outside the frame, 0 where none scatters, else the steps of its hungriest lane (1 where a pass has no loop).
+// One work group of 32 work-items is one warp; two warps are the 8x8 tile of one CTA. warp_steps
+// holds, per warp, -1 where all lanes lie outside the frame, 0 where none scatters, else the steps
+// of its hungriest lane (1 where a pass has no loop).
 
 #define PASS_KERNEL __kernel __attribute__((reqd_work_group_size(32, 1, 1))) void
 
@@ -22,7 +24,8 @@
     const int y = (int)((tile >> 16) * 8u + (slot >> 3)); \
     const bool inside = x < width && y < height;
 
-// A row's slot follows from (warp, step): rows of a warp are counted up in program order, by all of its lanes alike.
+// A row's slot follows from (warp, step): rows of a warp are counted up in program order, by all of
+// its lanes alike.
 #if TRACED
 #define TRACE_ARGS , __global uint *lanes, __global const uint *row_of_warp, const uint first_row
 #define FIND_ROW size_t slot_of_row = (size_t)(row_of_warp[warp] - first_row) * 32 + lane;
@@ -54,7 +57,8 @@ uint setup_index(uint level, int texel_y, int texel_x, int width, int height)
     return ((uint)texel_y + below) * pitch + (uint)texel_x + right;
 }
 
-// Setup texels are non-negative and hold no half-float denormals, so that they decode with a shift and a product.
+// Setup texels are non-negative and hold no half-float denormals, so that they decode with a shift
+// and a product.
 float4 load_setup(__global const ushort *setup, uint index)
 {
     return as_float4(convert_uint4(vload4(index, setup)) << 13) * 0x1p112f;
@@ -74,14 +78,16 @@ void store_half(__global half *texture, uint index, float4 value)
     vstore_half4_rte(value, index, texture);
 }
 
-// The pixel of the previous frame that shows what this one shows; nearest, it may lie outside the frame.
-int2 reproject(int x, int y, float2 velocity)
+// One coordinate of the pixel that showed this surface in the previous frame; nearest, it may lie
+// outside the frame.
+whole reproject(whole at, real velocity)
 {
-    const float2 position = (float2)((float)x + 0.5f, (float)y + 0.5f) + velocity;
-    return convert_int2(floor(clamp(position, (float2)(-1.0f), (float2)(32768.0f))));
+    const real past = at_most(at_least(to_real(at) + 0.5f + velocity, (real)(-1.0f)), (real)(32768.0f));
+    return to_whole(floor(past));
 }
 
-// Whether a history texel (mean count, depth, variance, mean) belongs to a surface at this depth: within a tenth of it.
+// Whether a history texel (mean count, depth, variance, mean) belongs to a surface at this depth:
+// within a tenth of it.
 bool has_history(float4 history, float depth)
 {
     const float difference = history.y - depth;

@@ -1,5 +1,5 @@
-// Estimate: this frame's sample count of each pixel from its history, before the sampling pass of the adaptive method.
-// Counts are stored in lane order, so that a warp's largest is one run.
+// Estimate: this frame's sample count of each pixel from its history, before the sampling pass of
+// the adaptive method. Counts are stored in lane order, so that a warp's largest is one run.
 PASS_KERNEL estimate(
     WARP_ARGS, __global const ushort *setup_texture, __global const float2 *velocity, __global const half *history,
     __global ushort *counts, const int has_velocity, const float sigma0_sq, const float kappa, const float k_minus_1,
@@ -9,7 +9,8 @@ PASS_KERNEL estimate(
     const float depth = inside ? load_setup(setup_texture, setup_index(0, y, x, width, height)).w : 0.0f;
     float count = 0.0f;
     if (depth > 0.0f) {
-        const int2 past = reproject(x, y, has_velocity ? velocity[y * width + x] : (float2)(0.0f));
+        const float2 moved = has_velocity ? velocity[y * width + x] : (float2)(0.0f);
+        const int2 past = (int2)(reproject(x, moved.x), reproject(y, moved.y));
 
         // A pixel without history stands at the target variance with the largest count.
         float mean_count = b_max;

@@ -1,4 +1,6 @@
-"""The frame loop: set-up, pre-filter, sampling, update and combine, with the history carried from frame to frame."""
+"""The frame loop: set-up, pre-filter, sampling, update and combine, with the history carried from
+frame to frame.
+"""
 
 from __future__ import annotations
 
@@ -25,10 +27,12 @@ Progress = Callable[[float], None]
 class Frame:
     """The pictures of one frame; h, w: its height and width.
 
-    index: frame number, from 0. scattered: (h, w, 3) float32, light after scattering, without albedo. combined: (h, w, 3) float32,
-    the finished picture. accumulated: (h, w, 3) float32, `combined` blended over the frames with the history's weight alpha, as a
-    temporal anti-aliasing pass would show it. counts: (h, w) uint16 samples of each pixel, 0 where nothing scatters. history:
-    (h, w, 4) float32 mean count, depth in cm, variance of the mean and mean; None for the fixed method.
+    index: frame number, from 0. scattered: (h, w, 3) float32, light after scattering, without
+    albedo. combined: (h, w, 3) float32, the finished picture. accumulated: (h, w, 3) float32,
+    `combined` blended over the frames with the history's weight alpha, as a temporal anti-aliasing
+    pass would show it. counts: (h, w) uint16 samples of each pixel, 0 where nothing scatters.
+    history: (h, w, 4) float32 mean count, depth in cm, variance of the mean and mean; None for the
+        fixed method.
     """
 
     index: int
@@ -49,7 +53,9 @@ def gbuffer_of(scene: Scene, frame: int) -> GBuffer:
 
 
 def advance(pipeline: Pipeline, scene: Scene, frame: int) -> None:
-    """Run one frame untraced. A still G-buffer keeps its setup texture and mip chain, which would come out the same."""
+    """Run one frame untraced. A still G-buffer keeps its setup texture and mip chain, which would
+    come out the same.
+    """
     changed = pipeline.load(gbuffer_of(scene, frame))
     for step in pipeline.steps:
         if changed or step.pass_name not in ("setup", "prefilter"):
@@ -79,7 +85,8 @@ def render(
 
     Args:
         scene: a G-buffer, or a function from frame number to G-buffer.
-        method: the settings. The adaptive method takes b_max samples (engine rule: b_min) in frame 0, which has no history.
+        method: the settings. The adaptive method takes b_max samples (engine rule: b_min) in frame
+            0, which has no history.
         num_frames: at least 1. Memory does not grow with it.
         device: from `open_device`; None opens the first that works.
         progress: called with the finished share, 0 to 1, after each frame.

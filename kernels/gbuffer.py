@@ -42,7 +42,9 @@ class GBuffer:
     def __post_init__(self) -> None:
         height, width = self.depth_cm.shape if self.depth_cm.ndim == 2 else (0, 0)
         if not height or not width:
-            raise InputError(f"{self.name}: depth: shape {self.depth_cm.shape}: need (height, width)")
+            raise InputError(
+                f"{self.name}: depth: shape {self.depth_cm.shape}: need (height, width)"
+            )
         for field in ("irradiance", "albedo", "non_subsurface", "normal"):
             self._check(field, (height, width, 3), np.float32)
         self._check("depth_cm", (height, width), np.float32)
@@ -50,11 +52,15 @@ class GBuffer:
         if self.velocity is not None:
             self._check("velocity", (height, width, 2), np.float32)
         if (self.depth_cm < 0).any():
-            raise InputError(f"{self.name}: depth_cm: negative values; allowed are 0 (nothing) and up")
+            raise InputError(
+                f"{self.name}: depth_cm: negative values; allowed are 0 (nothing) and up"
+            )
         if not self.projection_x > 0:
             raise InputError(f"{self.name}: projection_x {self.projection_x}: must be positive")
         if not ((self.profile_id > 0) & (self.depth_cm > 0)).any():
-            raise InputError(f"{self.name}: the G-buffer is empty: no pixel has a profile and a depth")
+            raise InputError(
+                f"{self.name}: the G-buffer is empty: no pixel has a profile and a depth"
+            )
 
     def _check(self, field: str, shape: tuple[int, ...], dtype: type) -> None:
         value = getattr(self, field)
@@ -63,7 +69,9 @@ class GBuffer:
                 f"{self.name}: {field}: {value.dtype} of shape {value.shape}: need {np.dtype(dtype)} of {shape}"
             )
         if not np.isfinite(value).all():
-            raise InputError(f"{self.name}: {field}: NaN or infinite values; only finite ones are allowed")
+            raise InputError(
+                f"{self.name}: {field}: NaN or infinite values; only finite ones are allowed"
+            )
 
     @property
     def height(self) -> int:

@@ -1,4 +1,6 @@
-"""Which pixel each lane of each warp works on: 8x8 tiles in CTA order, two warps of 32 lanes a tile."""
+"""Which pixel each lane of each warp works on: 8x8 tiles in CTA order, two warps of 32 lanes a
+tile.
+"""
 
 from __future__ import annotations
 
@@ -42,7 +44,9 @@ def lane_table(lane_map: str) -> npt.NDArray[np.uint8]:
 
 @dataclass(frozen=True)
 class Grid:
-    """The CTAs of one full-screen launch. width, height: pixels (of the destination level, for the pre-filter)."""
+    """The CTAs of one full-screen launch. width, height: pixels (of the destination level, for the
+    pre-filter).
+    """
 
     width: int
     height: int
@@ -70,7 +74,9 @@ class Grid:
 
     @cached_property
     def lanes(self) -> tuple[npt.NDArray[np.int32], npt.NDArray[np.int32]]:
-        """(x, y) of each lane, (num_warps, 32) int32; outside the frame where the tile overhangs it."""
+        """(x, y) of each lane, (num_warps, 32) int32; outside the frame where the tile overhangs
+        it.
+        """
         table = lane_table(self.lane_map).astype(np.int32)
         tiles = self.tiles.astype(np.int32)[:, None]
         x = (tiles & 0xFFFF) * TILE_SIDE + (table & 7)
@@ -84,12 +90,16 @@ class Grid:
         return (x < self.width) & (y < self.height)
 
     def gather(self, image: npt.NDArray[np.generic]) -> npt.NDArray[np.generic]:
-        """(num_warps, 32): an image's values in lane order; those of the nearest pixel for lanes outside."""
+        """(num_warps, 32): an image's values in lane order; those of the nearest pixel for lanes
+        outside.
+        """
         x, y = self.lanes
         return image[np.minimum(y, self.height - 1), np.minimum(x, self.width - 1)]
 
     def warp_states(self, mask: npt.NDArray[np.bool_] | None = None) -> npt.NDArray[np.int32]:
-        """(num_warps,) int32: `OUTSIDE`, `PLAIN`, or 1 where a lane's pixel is in `mask`, (height, width) bool."""
+        """(num_warps,) int32: `OUTSIDE`, `PLAIN`, or 1 where a lane's pixel is in `mask`, (height,
+        width) bool.
+        """
         states = np.where(self.inside.any(axis=1), PLAIN, OUTSIDE).astype(np.int32)
         if mask is not None:
             states[(self.gather(mask).astype(np.bool_) & self.inside).any(axis=1)] = 1

@@ -77,7 +77,7 @@ HEAD_INLINE float head_shadow(__global const float* restrict grid, float3 p, flo
         closest = fmin(closest, head_over(d, t * radius));
         if (closest < -1.0f || t > 26.0f)
             break;
-        t += fmin(fmax(fabs(d) * 0.9f, 0.03f + 0.03f * t), 6.0f);
+        t += fmin(fmax(fabs(d), 0.03f + 0.03f * t), 6.0f);
     }
     closest = fmax(closest, -1.0f);
     return 0.25f * (1.0f + closest) * (1.0f + closest) * (2.0f - closest);
@@ -119,7 +119,7 @@ __kernel void head_render(float4 origin, float4 right, float4 up, float4 forward
     if (t < FAR_CM && range.y >= range.x) {
         for (int step = 0; step < MAX_STEPS; ++step) {
             float d = head_far(grid, origin.xyz + direction * t);
-            t += d * 0.85f * inverse;
+            t += d * 0.95f * inverse;
             if (d < 0.5f * right.w * t) {
                 hit = true;
                 break;

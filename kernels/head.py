@@ -82,7 +82,14 @@ def render_head(
 
     for first_row in range(0, height, band_rows):
         rows = min(band_rows, height - first_row)
-        geometry = (*view, np.int32(width), np.int32(height), np.int32(first_row), np.int32(tiles_x), grid)
+        geometry = (
+            *view,
+            np.int32(width),
+            np.int32(height),
+            np.int32(first_row),
+            np.int32(tiles_x),
+            grid,
+        )
         start_kernel(device.queue, (tiles_x, -(-rows // TILE)), None, *geometry, start)
         render_kernel(
             device.queue,
@@ -102,9 +109,7 @@ def render_head(
         cl.enqueue_copy(device.queue, profile[first_row : first_row + rows], profile_buffer)
         if progress is not None:
             progress((first_row + rows) / height)
-    return GBuffer(
-        name=camera.name, profile_id=profile, projection_x=camera.projection_x, **planes
-    )
+    return GBuffer(name=camera.name, profile_id=profile, projection_x=camera.projection_x, **planes)
 
 
 @cache

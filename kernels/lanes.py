@@ -19,7 +19,9 @@ ROW_BYTES = WARP_SIZE * 4
 
 @dataclass(eq=False)
 class LaneBuffer:
-    """Memory that host and device share. mapping: the host's current view of it, None while the device writes."""
+    """Memory that host and device share. mapping: the host's current view of it, None while the
+    device writes.
+    """
 
     memory: npt.NDArray[np.uint8]
     buffer: cl.Buffer
@@ -27,7 +29,9 @@ class LaneBuffer:
 
 
 class LanePool:
-    """Buffers of one size. A buffer comes back by itself when the last array over its rows is gone."""
+    """Buffers of one size. A buffer comes back by itself when the last array over its rows is
+    gone.
+    """
 
     def __init__(self, device: Device, num_rows: int) -> None:
         self._device = device
@@ -50,19 +54,17 @@ class LanePool:
         return lent
 
     def lend(self, lent: LaneBuffer, num_rows: int) -> npt.NDArray[np.uint32]:
-        """(num_rows, 32) uint32: the rows, once all that was enqueued before has run; blocks until then."""
-        array, event = cl.enqueue_map_buffer(
-            self._device.queue,
-            lent.buffer,
-            cl.map_flags.READ,
-            0,
-            (max(1, num_rows) * WARP_SIZE,),
-            np.uint32,
-            is_blocking=False,
+        """(num_rows, 32) uint32: the rows, once all that was enqueued before has run; blocks until
+        then.
+        """
+        queue, size = self._device.queue, (max(1, num_rows) * WARP_SIZE,)
+        map_buffer: Any = cl.enqueue_map_buffer  # its stub refuses every dtype
+        array, event = map_buffer(
+            queue, lent.buffer, cl.map_flags.READ, 0, size, np.uint32, is_blocking=False
         )
         event.wait()
         lent.mapping = array.base
         # An array over a memoryview: slices of it keep it, and only it, alive.
-        owner = np.frombuffer(memoryview(lent.memory), np.uint32)
+        owner = np.frombuffer(lent.memory.data, np.uint32)
         weakref.finalize(owner, self._free.append, lent)
         return owner[: num_rows * WARP_SIZE].reshape(num_rows, WARP_SIZE)

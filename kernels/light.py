@@ -31,11 +31,15 @@ class Light:
 
     def __post_init__(self) -> None:
         if not any(self.towards) or not np.isfinite(self.towards).all():
-            raise InputError(f"light {self.name}: towards {self.towards}: must be a finite direction")
+            raise InputError(
+                f"light {self.name}: towards {self.towards}: must be a finite direction"
+            )
         if not np.isfinite(self.irradiance).all() or min(self.irradiance) < 0:
             raise InputError(f"light {self.name}: irradiance {self.irradiance}: must be 0 or more")
         if not 0 < self.radius <= 1:
-            raise InputError(f"light {self.name}: radius {self.radius}: must be above 0 and at most 1")
+            raise InputError(
+                f"light {self.name}: radius {self.radius}: must be above 0 and at most 1"
+            )
 
     def direction(self) -> npt.NDArray[np.float64]:
         """Unit vector towards the light."""

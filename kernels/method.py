@@ -30,16 +30,24 @@ _CHOICES: dict[str, tuple[str, ...]] = {
 class Method:
     """Adaptive filtered importance sampling, fixed or adaptive in its count; all lengths in mm.
 
-    kind: "fixed" takes num_samples everywhere; "adaptive" takes the count from the history. num_samples: 1 to 2048.
-    b_min, b_max: bounds of the adaptive count. kappa: damping of the paper's correction, in [0, 1]. alpha: weight of the newest
-        frame in the history, in (0, 1]. sigma0_sq: target variance of the tracked luminance (the paper 0.001; the engine 0.0001).
+    kind: "fixed" takes num_samples, 1 to 2048, everywhere; "adaptive" takes the count from the
+        history.
+    b_min, b_max: bounds of the adaptive count.
+    kappa: damping of the paper's correction, in [0, 1].
+    alpha: weight of the newest frame in the history, in [0.001, 1].
+    sigma0_sq: target variance of the tracked luminance (the paper 0.001; the engine 0.0001).
     rule: "paper" is kappa Delta + E, "engine" clamps variance / sigma0_sq.
-    inverse_cdf, mip_rule ("mip0" forces level 0), weights ("mean" is the dissertation's Algorithm 2), scale ("legacy" is the
-        wider screen step of the engine that the constant of Eq 5.12 was tuned on).
-    centre_reweighting: no sample lands on the centre pixel, whose share is added in closed form. bilateral: distances include the
-        depth difference. normal_weights: samples count less the further their normal turns away. prefilter: build the mip chain.
-    hash: constants of pcg3d16. profile: the material of every scattering pixel.
-    planes, passes: what a recording holds; the picture does not depend on them. normals are only read with normal_weights.
+    inverse_cdf: of the radius. mip_rule: "mip0" forces level 0.
+    weights: "mean" is the dissertation's Algorithm 2.
+    scale: "legacy" is the wider screen step of the engine that Eq 5.12 was tuned on.
+    centre_reweighting: no sample lands on the centre pixel, whose share is added in closed form.
+    bilateral: distances include the depth difference.
+    normal_weights: samples count less the further their normal turns away.
+    prefilter: build the mip chain.
+    hash: constants of pcg3d16.
+    profile: the material of every scattering pixel.
+    planes, passes: what a recording holds; the picture does not depend on them. Normals are only
+        read with normal_weights.
     tile_order, lane_map: CTA to 8x8 tile, and lane to pixel inside it.
     """
 

@@ -3,16 +3,42 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Protocol
 
 from kernels import combine, prefilter, sampling, setup, update
 from kernels.access import Access, Program
 from kernels.grid import Grid
 from kernels.method import Method
 
+if TYPE_CHECKING:
+    from kernels.pipeline import Pipeline
+
+
+class Pass(Protocol):
+    """What a pass's module offers, beside its NumPy `reference` and the `.cl` file of its name."""
+
+    def accesses(self, method: Method, frame: int) -> tuple[Access, ...]:
+        """The traced accesses of its kernel, in program order."""
+
+    def arguments(self, pipeline: Pipeline, level: int, frame: int) -> list[Any]:
+        """The kernel's arguments between the warp's and the trace's. level: as in `Step`."""
+
+
+#: The passes by name; `list_steps` says when each runs.
+PASSES: dict[str, Pass] = {
+    "setup": setup,
+    "prefilter": prefilter,
+    "sampling": sampling,
+    "update": update,
+    "combine": combine,
+}
+
 
 @dataclass(frozen=True)
 class Step:
-    """One kernel launch of a frame. level: the pre-filter's source level, else 0. grid: its CTAs."""
+    """One kernel launch of a frame. level: the pre-filter's source level, else 0. grid: its
+    CTAs.
+    """
 
     pass_name: str
     level: int
@@ -20,24 +46,19 @@ class Step:
 
     def program(self, method: Method, frame: int, first_instruction: int = 0) -> Program:
         """The pass's accesses in that frame."""
-        return Program(self.pass_name, _accesses(self.pass_name, method, frame), first_instruction)
+        return Program(
+            self.pass_name, PASSES[self.pass_name].accesses(method, frame), first_instruction
+        )
 
 
 def list_steps(method: Method, grid: Grid, num_levels: int) -> list[Step]:
     """Every launch of a frame, traced or not; grid: the full screen's."""
-    levels = [
-        Step("prefilter", k, Grid(max(1, grid.width >> k + 1), max(1, grid.height >> k + 1), grid.tile_order, grid.lane_map))
-        for k in range(num_levels - 1)
-    ]
-    after = ["sampling", *["update"] * method.adaptive, "combine"]
-    return [Step("setup", 0, grid), *levels, *(Step(name, 0, grid) for name in after)]
-
-
-def _accesses(pass_name: str, method: Method, frame: int) -> tuple[Access, ...]:
-    return {
-        "setup": lambda: setup.ACCESSES,
-        "prefilter": lambda: prefilter.ACCESSES,
-        "sampling": lambda: sampling.accesses(method, frame),
-        "update": lambda: update.accesses(frame),
-        "combine": lambda: combine.accesses(method),
-    }[pass_name]()
+    steps = [Step("setup", 0, grid)]
+    for level in range(num_levels - 1):
+        width, height = grid.width >> level + 1, grid.height >> level + 1
+        coarser = Grid(width, height, grid.tile_order, grid.lane_map)
+        steps.append(Step("prefilter", level, coarser))
+    steps.append(Step("sampling", 0, grid))
+    if method.adaptive:
+        steps.append(Step("update", 0, grid))
+    return [*steps, Step("combine", 0, grid)]

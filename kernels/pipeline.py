@@ -1,4 +1,6 @@
-"""The passes on a device: buffers that live over all frames, and one enqueue per launch or part of a launch."""
+"""The passes on a device: buffers that live over all frames, and one enqueue per launch or part of
+a launch.
+"""
 
 from __future__ import annotations
 
@@ -9,13 +11,13 @@ import numpy as np
 import numpy.typing as npt
 import pyopencl as cl
 
-from kernels import combine, program, resources, sampling, update
+from kernels import program, resources, sampling
 from kernels.access import States
 from kernels.device import Device
 from kernels.gbuffer import GBuffer
-from kernels.grid import Grid
+from kernels.grid import Grid, lane_table
 from kernels.method import Method
-from kernels.passes import Step, list_steps
+from kernels.passes import PASSES, Step, list_steps
 from traces.errors import InputError
 from traces.texture import WARP_SIZE
 
@@ -24,7 +26,9 @@ _BYTES = {"depth": 4, "gbuffer_id": 1, "normal": 4, "profile_id": 1}  # of a dev
 
 @dataclass(frozen=True)
 class TraceTarget:
-    """Where a traced launch writes. lanes: device buffer. row_of_warp: device buffer, (num_warps,) uint32. first_row: row of lanes[0]."""
+    """Where a traced launch writes. lanes: device buffer. row_of_warp: device buffer, (num_warps,)
+    uint32. first_row: row of lanes[0].
+    """
 
     lanes: cl.Buffer
     row_of_warp: cl.Buffer
@@ -34,7 +38,9 @@ class TraceTarget:
 class Pipeline:
     """The device state of one method at one frame size.
 
-    states: (num_warps,) int32 of the full-screen grid, as `Grid.warp_states`; of the loaded G-buffer.
+    buffers: device buffers by texture name, and "counts" and "ratio".
+    states: (num_warps,) int32 of the full-screen grid, as `Grid.warp_states`.
+    states, constants, has_velocity: of the loaded G-buffer.
     """
 
     def __init__(self, method: Method, width: int, height: int, device: Device) -> None:
@@ -46,8 +52,8 @@ class Pipeline:
         self.steps = list_steps(method, self.grid, self.num_levels)
         self.states: States = self.grid.warp_states()
         self._gbuffer: GBuffer | None = None
-        self._programs = {False: program.build(device, method, traced=False)}
-        self._buffers = {name: self.allocate(size) for name, size in self._sizes().items()}
+        self._kernels: dict[tuple[str, bool], cl.Kernel] = {}
+        self.buffers = {name: self.allocate(size) for name, size in self._sizes().items()}
         self._tables: dict[Grid, tuple[cl.Buffer, cl.Buffer]] = {}
         self._clear_histories()
 
@@ -74,8 +80,10 @@ class Pipeline:
 
     def _clear_histories(self) -> None:
         for name in ("history_0", "history_1"):
-            buffer = self._buffers[name]
-            cl.enqueue_fill_buffer(self.device.queue, buffer, np.uint64(0), 0, buffer.size)
+            buffer = self.buffers[name]
+            cl.enqueue_fill_buffer(
+                self.device.queue, buffer, np.zeros(1, np.uint64), 0, buffer.size
+            )
 
     def load(self, gbuffer: GBuffer) -> bool:
         """Upload a G-buffer; False if it is the one that is loaded.
@@ -87,40 +95,42 @@ class Pipeline:
             return False
         if (gbuffer.width, gbuffer.height) != (self.width, self.height):
             raise InputError(
-                f"{gbuffer.name}: size {gbuffer.width}x{gbuffer.height}: all frames must be {self.width}x{self.height}"
+                f"{gbuffer.name}: size {gbuffer.width}x{gbuffer.height}: "
+                f"all frames must be {self.width}x{self.height}"
             )
         for name, array in resources.inputs(gbuffer).items():
-            if self._buffers[name].size < array.nbytes:
-                self._buffers[name] = self.allocate(array.nbytes)
-            cl.enqueue_copy(self.device.queue, self._buffers[name], array)
+            if self.buffers[name].size < array.nbytes:
+                self.buffers[name] = self.allocate(array.nbytes)
+            cl.enqueue_copy(self.device.queue, self.buffers[name], array)
         self._gbuffer = gbuffer
         self.states = self.grid.warp_states(gbuffer.subsurface)
-        constants = sampling.Constants.of(self.method, self.width, self.height, gbuffer.projection_x)
-        self._constants = constants
-        self._buffers["ratio"] = self.upload(constants.ratio)
+        self.has_velocity = np.int32(gbuffer.velocity is not None)
+        self.constants = sampling.Constants.of(
+            self.method, self.width, self.height, gbuffer.projection_x
+        )
+        self.buffers["ratio"] = self.upload(self.constants.ratio)
         return True
 
     def count_samples(self, frame: int) -> States:
-        """The sampling pass's warp states: steps of each warp's hungriest lane. Runs the estimate where counts adapt."""
+        """The sampling pass's warp states: steps of each warp's hungriest lane. Runs the estimate
+        where counts adapt.
+        """
         if not self.method.adaptive:
-            steps: States = np.where(self.states > 0, self.method.num_samples, self.states).astype(np.int32)
+            steps: States = np.where(self.states > 0, self.method.num_samples, self.states).astype(
+                np.int32
+            )
             return steps
-        method, b = self.method, self._buffers
-        arguments = [
-            b["setup"],
-            b["velocity"],
-            b[update.history_names(frame)[0]],
-            b["counts"],
-            self._has_velocity,
-            np.float32(method.sigma0_sq),
-            np.float32(method.kappa),
-            np.float32(sampling.k_minus_1(method)),
-            np.float32(method.b_min),
-            np.float32(method.b_max),
-        ]
-        self._enqueue("estimate", self.grid, self._state_buffer(self.states), 0, self.grid.num_warps, arguments)
+        arguments = sampling.estimate_arguments(self, frame)
+        self._enqueue(
+            "estimate",
+            self.grid,
+            self.upload(self.states),
+            0,
+            self.grid.num_warps,
+            arguments,
+        )
         counts = np.empty((self.grid.num_warps, WARP_SIZE), np.uint16)
-        cl.enqueue_copy(self.device.queue, counts, b["counts"])
+        cl.enqueue_copy(self.device.queue, counts, self.buffers["counts"])
         return np.where(self.states > 0, counts.max(axis=1), self.states).astype(np.int32)
 
     def states_of(self, step: Step, frame: int) -> States:
@@ -131,7 +141,7 @@ class Pipeline:
 
     def run(self, step: Step, frame: int, states: States) -> None:
         """Enqueue a whole launch, untraced."""
-        self.run_warps(step, frame, self._state_buffer(states), 0, step.grid.num_warps)
+        self.run_warps(step, frame, self.upload(states), 0, step.grid.num_warps)
 
     def run_warps(
         self,
@@ -142,20 +152,15 @@ class Pipeline:
         num_warps: int,
         target: TraceTarget | None = None,
     ) -> cl.Event:
-        """Enqueue warps [first_warp, first_warp + num_warps) of a launch, traced where there is a target."""
-        arguments = self._arguments(step, frame)
+        """Enqueue warps [first_warp, first_warp + num_warps) of a launch, traced where there is a
+        target.
+        """
+        arguments = PASSES[step.pass_name].arguments(self, step.level, frame)
         if target is not None:
             arguments += [target.lanes, target.row_of_warp, np.uint32(target.first_row)]
         return self._enqueue(
             step.pass_name, step.grid, states, first_warp, num_warps, arguments, target is not None
         )
-
-    def upload_states(self, states: npt.NDArray[Any]) -> cl.Buffer:
-        """A device buffer of per-warp numbers."""
-        return self._state_buffer(states)
-
-    def _state_buffer(self, states: npt.NDArray[Any]) -> cl.Buffer:
-        return self.upload(states)
 
     def _enqueue(
         self,
@@ -167,19 +172,18 @@ class Pipeline:
         arguments: list[Any],
         traced: bool = False,
     ) -> cl.Event:
-        if traced not in self._programs:
-            self._programs[traced] = program.build(self.device, self.method, traced)
+        if (name, traced) not in self._kernels:
+            built = program.build(self.device, self.method, name, traced)
+            self._kernels[name, traced] = cl.Kernel(built, name)
         if grid not in self._tables:
-            from kernels.grid import lane_table
-
             self._tables[grid] = (self.upload(grid.tiles), self.upload(lane_table(grid.lane_map)))
         tiles, lanes = self._tables[grid]
-        kernel = cl.Kernel(self._programs[traced], name)
         size = (np.int32(grid.width), np.int32(grid.height))
-        return kernel(
+        items = WARP_SIZE // program.lanes_per_item(self.device, name)
+        return self._kernels[name, traced](
             self.device.queue,
-            (num_warps * WARP_SIZE,),
-            (WARP_SIZE,),
+            (num_warps * items,),
+            (items,),
             np.uint32(first_warp),
             states,
             tiles,
@@ -188,54 +192,16 @@ class Pipeline:
             *arguments,
         )
 
-    @property
-    def _has_velocity(self) -> np.int32:
-        return np.int32(self._gbuffer is not None and self._gbuffer.velocity is not None)
-
-    def _arguments(self, step: Step, frame: int) -> list[Any]:
-        """The kernel's arguments between the warp's and the trace's."""
-        b, c, method = self._buffers, self._constants, self.method
-        if step.pass_name == "setup":
-            return [b[n] for n in ("scene_light", "depth", "gbuffer_id", "setup", "profile_id")]
-        if step.pass_name == "prefilter":
-            return [b["setup"], np.uint32(step.level), np.int32(self.width), np.int32(self.height)]
-        if step.pass_name == "sampling":
-            names = ("setup", "normal", "profile_id", "counts", "velocity", "scattered")
-            return [
-                *(b[n] for n in names),
-                self._has_velocity,
-                np.int32(method.num_samples),
-                np.uint32(frame),
-                np.int32(self.num_levels),
-                b["ratio"],
-                c.texels_per_mm_at_cm,
-                c.d,
-                *c.rate,
-                *c.density,
-                c.mip_scale,
-            ]
-        if step.pass_name == "update":
-            old, new = update.history_names(frame)
-            names = ("scattered", "velocity", "depth", old, "resolved", new)
-            return [
-                *(b[n] for n in names),
-                self._has_velocity,
-                np.float32(method.alpha),
-                np.float32(method.sigma0_sq),
-            ]
-        names = ("scene_colour", "profile_id", combine.result_name(method), "albedo", "output")
-        return [b[n] for n in names]
-
     def read(self, name: str) -> npt.NDArray[np.float32]:
         """(height, width, 4) float32: an RGBA16F texture's content."""
         texels = np.empty((self.height, self.width, 4), np.float16)
-        cl.enqueue_copy(self.device.queue, texels, self._buffers[name])
+        cl.enqueue_copy(self.device.queue, texels, self.buffers[name])
         return texels.astype(np.float32)
 
     def read_levels(self) -> list[npt.NDArray[np.float16]]:
         """The setup texture's levels, each (height, width, 4) float16."""
         packed = np.empty((self.height, self.width + self.width // 2, 4), np.float16)
-        cl.enqueue_copy(self.device.queue, packed, self._buffers["setup"])
+        cl.enqueue_copy(self.device.queue, packed, self.buffers["setup"])
         levels = [packed[:, : self.width]]
         for k in range(1, self.num_levels):
             top = self.height - (self.height >> k - 1)

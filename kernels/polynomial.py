@@ -1,8 +1,9 @@
 """Float32 log, exp, cbrt, gamma and sine/cosine that OpenCL and NumPy compute to the same bit.
 
-The twins of polynomial.cl, operation by operation: only +, -, *, correctly rounded / and sqrt, integers and bit casts. Built-in
-transcendentals differ between OpenCL implementations by a few texels in a million; these do not. Truncated Taylor series on
-ranges short enough that the first term left out is below half a unit in the last place.
+The twins of polynomial.cl, operation by operation: only +, -, *, correctly rounded / and sqrt,
+integers and bit casts. Built-in transcendentals differ between OpenCL implementations by a few
+texels in a million; these do not. Truncated Taylor series on ranges short enough that the first
+term left out is below half a unit in the last place.
 """
 
 from __future__ import annotations
@@ -16,6 +17,9 @@ _F = np.float32
 _LN2_HIGH = _F(float.fromhex("0x1.62ep-1"))
 _LN2_LOW = _F(float.fromhex("0x1.0bfbe8p-15"))
 _LOG2_E = _F(float.fromhex("0x1.715476p+0"))
+_ROUND_TO_INTEGER = _F(
+    3 << 22
+)  # added to a small number, it leaves the nearest integer in the low bits
 _SQRT_HALF_BITS = np.int32(0x3F3504F3)
 _TURN_TO_RADIANS = _F(float.fromhex("0x1.921fb6p-30"))
 _ONE = _F(1)
@@ -33,7 +37,9 @@ _DARK = _F(2.0**-24)
 
 
 def poly_log(x: Float) -> Float:
-    """Natural logarithm. `x`: float32, positive and normal; within 2 ulp, or 1e-7 absolute near 1."""
+    """Natural logarithm. `x`: float32, positive and normal; within 2 ulp, or 1e-7 absolute near
+    1.
+    """
     bits = x.view(np.int32)
     exponent = (bits - _SQRT_HALF_BITS) >> np.int32(23)
     f = (bits - (exponent << np.int32(23))).view(np.float32) - _ONE
@@ -47,9 +53,9 @@ def poly_log(x: Float) -> Float:
 
 
 def poly_exp(x: Float) -> Float:
-    """e^x. `x`: float32, clamped to [-86, 86]; within 2 ulp."""
-    x = np.clip(x, _F(-86), _F(86))
-    n = np.floor(x * _LOG2_E + _F(0.5))
+    """e^x. `x`: float32 in [-86, 86]; within 2 ulp."""
+    shifted = x * _LOG2_E + _ROUND_TO_INTEGER
+    n = shifted - _ROUND_TO_INTEGER
     r = (x - n * _LN2_HIGH) - n * _LN2_LOW
     series = _F6 + r * _F7
     series = _F5 + r * series
@@ -58,8 +64,8 @@ def poly_exp(x: Float) -> Float:
     series = _F(0.5) + r * series
     series = _ONE + r * series
     series = _ONE + r * series
-    power = ((n.astype(np.int32) + np.int32(127)) << np.int32(23)).view(np.float32)
-    result: Float = series * power
+    power = (shifted.view(np.int32) << np.int32(23)) + np.int32(0x3F800000)
+    result: Float = series * power.view(np.float32)
     return result
 
 
@@ -73,14 +79,16 @@ def poly_cbrt(x: Float) -> Float:
 
 
 def poly_gamma(x: Float) -> Float:
-    """x^(1/2.2), within 12 ulp. `x`: float32, at least 0; 0 below 2^-24."""
+    """x^(1/2.2), within 12 ulp. `x`: float32, in [0, 2^17]; 0 below 2^-24."""
     power = poly_exp(poly_log(np.maximum(x, _DARK)) * _GAMMA)
     result: Float = np.where(x < _DARK, _F(0), power)
     return result
 
 
 def poly_cos_sin(turn: npt.NDArray[np.uint32]) -> tuple[Float, Float]:
-    """(cosine, sine) of 2 pi turn / 2^32. `turn`: uint32, the fraction of a turn in fixed point; within 1e-7."""
+    """(cosine, sine) of 2 pi turn / 2^32. `turn`: uint32, the fraction of a turn in fixed point;
+    within 1e-7.
+    """
     shifted = turn + np.uint32(0x20000000)
     quadrant = shifted >> np.uint32(30)
     rest = (shifted & np.uint32(0x3FFFFFFF)).view(np.int32) - np.int32(0x20000000)

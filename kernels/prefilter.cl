@@ -1,7 +1,8 @@
-// Pre-filter: one level of the setup texture's mip chain, a bilinear tap of the finer level at each texel's centre.
-// width and height are the destination level's.
+// Pre-filter: one level of the setup texture's mip chain, a bilinear tap of the finer level at each
+// texel's centre. width and height are the destination level's.
 
-// The texel left of the centre of destination texel `at`, and the weight of its right neighbour, from integers alone.
+// The texel left of the centre of destination texel `at`, and the weight of its right neighbour,
+// from integers alone.
 int2 find_tap(int at, int source_size, int size, float *weight)
 {
     const int twice = (2 * at + 1) * source_size - size;  // (centre in source texels - 1/2) * 2 size

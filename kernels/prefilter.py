@@ -1,11 +1,13 @@
-"""Pre-filter pass: each level of the setup texture from the finer one, a bilinear tap at every destination texel's centre.
+"""Pre-filter pass: each level of the setup texture from the finer one, a bilinear tap at every
+destination texel's centre.
 
-One launch per level. Not depth-aware: texels that do not scatter count with their zeros, as in the engine.
+One launch per level. Not depth-aware: texels that do not scatter count with their zeros, as in the
+engine.
 """
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -13,22 +15,38 @@ import numpy.typing as npt
 from kernels import resources
 from kernels.access import Access
 from kernels.grid import Grid
+from kernels.method import Method
 from kernels.setup import texels
 from traces.texture import INACTIVE_TEXEL, pack_texel
 
-# Arithmetic counts are assumed: a texture unit filters, so the load's four products are not instructions.
-ACCESSES = (
-    Access("setup", footprint="bilinear", arithmetic=(("int", 10), ("fp32", 4))),
-    Access("setup", "store", arithmetic=(("int", 4),), num_outstanding=0),
-)
+if TYPE_CHECKING:
+    from kernels.pipeline import Pipeline
+
+
+def accesses(method: Method, frame: int) -> tuple[Access, ...]:
+    """The pass's accesses, the same for every method and frame."""
+    # Arithmetic counts are assumed: a texture unit filters, so the load's four products are not
+    # instructions.
+    return (
+        Access("setup", footprint="bilinear", arithmetic=(("int", 10), ("fp32", 4))),
+        Access("setup", "store", arithmetic=(("int", 4),), num_outstanding=0),
+    )
 
 
 def find_taps(source_size: int, size: int) -> tuple[Any, Any, Any]:
-    """(left, right, weight of the right) of each of `size` destination texels along one axis; int64, int64, float32."""
+    """(left, right, weight of the right) of each of `size` destination texels along one axis;
+    int64, int64, float32.
+    """
     twice = (2 * np.arange(size, dtype=np.int64) + 1) * source_size - size
     left = twice // (2 * size)
     weight = (twice - left * 2 * size).astype(np.float32) / np.float32(2 * size)
     return left, np.minimum(left + 1, source_size - 1), weight
+
+
+def arguments(pipeline: Pipeline, level: int, frame: int) -> list[Any]:
+    """The kernel's arguments between the warp's and the trace's."""
+    size = (np.int32(pipeline.width), np.int32(pipeline.height))
+    return [pipeline.buffers["setup"], np.uint32(level), *size]
 
 
 def reference(grid: Grid, textures: dict[str, Any], level: int) -> list[npt.NDArray[np.uint32]]:
@@ -46,5 +64,7 @@ def reference(grid: Grid, textures: dict[str, Any], level: int) -> list[npt.NDAr
     textures["setup"] = [*textures["setup"], resources.to_setup(filtered)]
 
     x, y = grid.lanes
-    tap = pack_texel(level, above[np.minimum(y, grid.height - 1)], left[np.minimum(x, grid.width - 1)])
+    tap = pack_texel(
+        level, above[np.minimum(y, grid.height - 1)], left[np.minimum(x, grid.width - 1)]
+    )
     return [np.where(grid.inside, tap, INACTIVE_TEXEL), texels(grid, grid.inside, level + 1)]

@@ -1,7 +1,9 @@
-"""Burley's normalised diffusion profile: value, density, distribution, its inverses, and the shape fits.
+"""Burley's normalised diffusion profile: value, density, distribution, its inverses, and the shape
+fits.
 
-Sources: [CB15] Christensen and Burley 2015, technical memo 15-04; [G19] Golubev, Sampling Burley's Normalized Diffusion
-Profiles, 2019. Lengths are mm; `d` is the profile's scale, the diffuse mean free path over the shape s(A).
+Sources: [CB15] Christensen and Burley 2015, technical memo 15-04; [G19] Golubev, Sampling Burley's
+Normalized Diffusion Profiles, 2019. Lengths are mm; `d` is the profile's scale, the diffuse mean
+free path over the shape s(A).
 """
 
 from __future__ import annotations
@@ -46,7 +48,9 @@ def inverse_cdf_exact(xi: Numbers, d: Numbers) -> Any:
 
 
 def inverse_cdf_approximate(xi: Numbers, d: Numbers, c: float = APPROXIMATE_C) -> Any:
-    """d ((2 - c) xi - 2) ln(1 - xi): the radius with a relative error of at most 2.4 % up to xi = 0.8, -14.3 % at 1."""
+    """d ((2 - c) xi - 2) ln(1 - xi): the radius with a relative error of at most 2.4 % up to xi =
+    0.8, -14.3 % at 1.
+    """
     xi = np.asarray(xi, np.float64)
     return d * ((2 - c) * xi - 2) * np.log1p(-xi)
 
@@ -71,7 +75,10 @@ def shape_dmfp(albedo: Numbers) -> Any:
 
 @dataclass(frozen=True)
 class Profile:
-    """One material. albedo: per channel, in [0, 1]. dmfp_mm: diffuse mean free path per channel, > 0."""
+    """One material.
+
+    albedo: per channel, in [0, 1]. dmfp_mm: diffuse mean free path per channel, above 0.
+    """
 
     name: str
     albedo: tuple[float, float, float]
@@ -80,7 +87,7 @@ class Profile:
     def __post_init__(self) -> None:
         if len(self.albedo) != 3 or not all(0 <= a <= 1 for a in self.albedo):
             raise InputError(f"profile {self.name!r}: albedo {self.albedo}: need three in [0, 1]")
-        if len(self.dmfp_mm) != 3 or not all(0 < l < float("inf") for l in self.dmfp_mm):
+        if len(self.dmfp_mm) != 3 or not all(0 < length < float("inf") for length in self.dmfp_mm):
             raise InputError(f"profile {self.name!r}: dmfp_mm {self.dmfp_mm}: need three above 0")
 
     @property
@@ -95,7 +102,10 @@ class Profile:
     @property
     def d_mm(self) -> tuple[float, float, float]:
         """Profile scale of each channel."""
-        r, g, b = (float(l / shape_dmfp(a)) for l, a in zip(self.dmfp_mm, self.albedo, strict=True))
+        r, g, b = (
+            float(length / shape_dmfp(a))
+            for length, a in zip(self.dmfp_mm, self.albedo, strict=True)
+        )
         return r, g, b
 
     @property

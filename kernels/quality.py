@@ -1,4 +1,6 @@
-"""Image quality as the dissertation measures it: PSNR on luminance against 1024 samples per pixel."""
+"""Image quality as the dissertation measures it: PSNR on luminance against 1024 samples per
+pixel.
+"""
 
 from __future__ import annotations
 
@@ -21,28 +23,36 @@ _LUMINANCE = np.array([0.2126, 0.7152, 0.0722])
 def reference_image(
     gbuffer: GBuffer, method: Method, device: Device | None = None, num_samples: int = 1024
 ) -> Float:
-    """(h, w, 3) float32: the finished picture with `num_samples` everywhere, all from level 0; other settings are the method's."""
+    """(h, w, 3) float32: the finished picture with `num_samples` everywhere, all from level 0;
+    other settings are the method's.
+    """
     exact = dataclasses.replace(method, kind="fixed", num_samples=num_samples, mip_rule="mip0")
     return render(gbuffer, exact, 1, device).combined
 
 
 def luminance(image: Float) -> npt.NDArray[np.float64]:
-    """(h, w) float64 luminance of the picture as shown: linear RGB clipped to [0, 1], weighted, to the power 1/2.2."""
+    """(h, w) float64 luminance of the picture as shown: linear RGB clipped to [0, 1], weighted, to
+    the power 1/2.2.
+    """
     return np.asarray((np.clip(image, 0, 1).astype(np.float64) @ _LUMINANCE) ** (1 / 2.2))
 
 
 def psnr(image: Float, reference: Float, mask: npt.NDArray[np.bool_]) -> float:
-    """Peak signal-to-noise ratio in dB of the shown luminance, peak 1, over the pixels of `mask`; infinite for equal pictures.
+    """Peak signal-to-noise ratio in dB of the shown luminance, peak 1, over the pixels of `mask`;
+    infinite for equal pictures.
 
     Args:
         image, reference: (h, w, 3) float32, linear.
-        mask: (h, w) bool, the population: for this study the pixels that scatter, `GBuffer.subsurface`.
+        mask: (h, w) bool, the population: for this study the pixels that scatter,
+            `GBuffer.subsurface`.
 
     Raises:
         InputError: shapes differ, or the mask is empty.
     """
     if image.shape != reference.shape or image.shape[:2] != mask.shape:
-        raise InputError(f"psnr: shapes {image.shape}, {reference.shape}, {mask.shape} do not match")
+        raise InputError(
+            f"psnr: shapes {image.shape}, {reference.shape}, {mask.shape} do not match"
+        )
     if not mask.any():
         raise InputError("psnr: the mask is empty")
     error = float(np.mean((luminance(image)[mask] - luminance(reference)[mask]) ** 2))

@@ -1,7 +1,9 @@
-"""Recorder: renders a scene and streams the texel fetches of its passes as a `Trace`, in chunks of CTAs, in launch order.
+"""Recorder: renders a scene and streams the texel fetches of its passes as a `Trace`, in chunks of
+CTAs, in launch order.
 
-While the consumer works on one chunk, the device writes the next. The kernels write packed texels into rows whose places follow
-from (warp, step), so a chunk holds the same bits whatever its size and whatever order the device ran it in.
+While the consumer works on one chunk, the device writes the next. The kernels write packed texels
+into rows whose places follow from (warp, step), so a chunk holds the same bits whatever its size
+and whatever order the device ran it in.
 """
 
 from __future__ import annotations
@@ -44,17 +46,20 @@ def record(
     chunk_bytes: int = CHUNK_BYTES,
     self_check: bool = True,
 ) -> Trace:
-    """A trace of rendering `scene`; each run of its chunks renders again, with memory that does not grow with the frames.
+    """A trace of rendering `scene`; each run of its chunks renders again, with memory that does not
+    grow with the frames.
 
     Args:
         scene: a G-buffer, or a function from frame number to G-buffer.
         method: the settings; its `passes` and `planes` say what is traced.
-        num_frames: frames to render; the adaptive method needs some (about 8) for its history to settle.
+        num_frames: frames to render; the adaptive method needs some (about 8) for its history to
+            settle.
         traced_frames: "last", "all", or frame numbers.
         device: from `open_device`; None opens the first that works.
         progress: called with the finished share, 0 to 1, while chunks are consumed.
         chunk_bytes: aimed size of a chunk's lanes; a chunk holds at least one CTA.
-        self_check: compare a small frame with the NumPy reference; the manifest's `differing_fetches` says how many differ.
+        self_check: compare a small frame with the NumPy reference; the manifest's
+            `differing_fetches` says how many differ.
 
     Raises:
         InputError: num_frames or traced_frames, or frames of different size.
@@ -87,7 +92,9 @@ def record(
 
 
 def estimate_rows(gbuffer: GBuffer, method: Method, num_traced_frames: int = 1) -> int:
-    """Rows of a recording before it is made: exact for the fixed method, the most (b_max everywhere) for the adaptive."""
+    """Rows of a recording before it is made: exact for the fixed method, the most (b_max
+    everywhere) for the adaptive.
+    """
     width, height = gbuffer.width, gbuffer.height
     grid = Grid(width, height, method.tile_order, method.lane_map)
     states = grid.warp_states(gbuffer.subsurface)
@@ -101,7 +108,9 @@ def estimate_bytes(gbuffer: GBuffer, method: Method, num_traced_frames: int = 1)
 
 
 def _most_rows(step: Step, method: Method, states: States) -> int:
-    """Rows of a launch with every scattering warp at its largest count; 0 if the pass is not traced."""
+    """Rows of a launch with every scattering warp at its largest count; 0 if the pass is not
+    traced.
+    """
     if step.pass_name not in method.passes:
         return 0
     if step.pass_name == "prefilter":
@@ -137,7 +146,8 @@ def _versions() -> dict[str, str]:
 class _Plan:
     """What is known before rendering: programs, instructions and launches.
 
-    programs: by (pass, frame parity), as the history textures swap. launch_of: index in `launches` by (frame, number of the step).
+    programs: by (pass, frame parity), as the history textures swap. launch_of: index in `launches`
+        by (frame, number of the step).
     """
 
     method: Method
@@ -236,7 +246,10 @@ class _Recording:
                 self._progress((frame + 1) / (last + 1))
                 continue
             changed = pipeline.load(gbuffer_of(self._scene, frame))
-            done, total = 0, max(1, sum(_most_rows(s, method, pipeline.states) for s in pipeline.steps))
+            done, total = (
+                0,
+                max(1, sum(_most_rows(s, method, pipeline.states) for s in pipeline.steps)),
+            )
             for number, step in enumerate(pipeline.steps):
                 states = pipeline.states_of(step, frame)
                 if (frame, number) in self._plan.launch_of:
@@ -257,14 +270,19 @@ class _Recording:
         launch = self._plan.launch_of[frame, number]
         cta, num_ctas = 0, step.grid.num_ctas
         while cta < num_ctas:
-            end = int(np.searchsorted(rows_of_cta, rows_of_cta[cta] + self._max_rows, side="right")) - 1
+            end = (
+                int(np.searchsorted(rows_of_cta, rows_of_cta[cta] + self._max_rows, side="right"))
+                - 1
+            )
             first, past = cta * WARPS_PER_CTA, end * WARPS_PER_CTA
             lent = self._pool.take()
             target = TraceTarget(lent.buffer, row_buffer, int(offsets[first]))
             self._pipeline.run_warps(step, frame, state_buffer, first, past - first, target)
             self._pipeline.device.queue.flush()
             part = slice(first, past + 1)
-            make = _chunk_maker(launch, cta, access, states[first:past], offsets[part] - offsets[first])
+            make = _chunk_maker(
+                launch, cta, access, states[first:past], offsets[part] - offsets[first]
+            )
             yield _Pending(make, lent, int(offsets[past] - offsets[first]), 0.0)
             cta = end
 
@@ -272,7 +290,9 @@ class _Recording:
 def _chunk_maker(
     launch: int, first_cta: int, access: Program, states: States, offsets: Offsets
 ) -> Callable[[Any], Chunk]:
-    """Makes the chunk once its lanes are there; its instructions are written while the device still works."""
+    """Makes the chunk once its lanes are there; its instructions are written while the device still
+    works.
+    """
     instruction = access.row_instructions(states, offsets)
     return lambda lanes: Chunk(launch, first_cta, offsets, instruction, lanes)
 

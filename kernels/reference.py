@@ -1,6 +1,8 @@
-"""The method in plain NumPy, bit for bit what the kernels compute: one frame after another, with the trace of each launch.
+"""The method in plain NumPy, bit for bit what the kernels compute: one frame after another, with
+the trace of each launch.
 
-Slow and obvious: every lane of the frame at once, one sample after another. Each pass module holds its own `reference`.
+Slow and obvious: every lane of the frame at once, one sample after another. Each pass module holds
+its own `reference`.
 """
 
 from __future__ import annotations
@@ -24,9 +26,10 @@ Array = npt.NDArray[Any]
 class ReferenceFrame:
     """What one frame left behind.
 
-    textures: contents by name as the device holds them (half floats as float16; `setup` a list of levels).
-    counts: (height, width) uint16 samples of each pixel. launches: per launch its step, (num_warps + 1,) row offsets and
-    (num_rows, 32) uint32 texels.
+    textures: contents by name as the device holds them (half floats as float16; `setup` a list of
+        levels).
+    counts: (height, width) uint16 samples of each pixel. launches: per launch its step, (num_warps
+    + 1,) row offsets and (num_rows, 32) uint32 texels.
     """
 
     textures: dict[str, Any]

@@ -1,6 +1,7 @@
 """The textures of the method: their descriptors in a trace, and what the G-buffer puts into them.
 
-Formats and levels as in Unreal Engine's passes. Memory here may be wider than the format where precision does not decide a texel.
+Formats and levels as in Unreal Engine's passes. Memory here may be wider than the format where
+precision does not decide a texel.
 """
 
 from __future__ import annotations
@@ -77,7 +78,9 @@ def pack_normals(normal: Float) -> npt.NDArray[np.uint32]:
 
 
 def inputs(gbuffer: GBuffer) -> dict[str, npt.NDArray[Any]]:
-    """The contents of the textures that the G-buffer fills, by name; `velocity` only where something moves."""
+    """The contents of the textures that the G-buffer fills, by name; `velocity` only where
+    something moves.
+    """
     found: dict[str, npt.NDArray[Any]] = {
         "scene_light": _with_alpha(np.maximum(gbuffer.irradiance, np.float32(0))),
         "depth": gbuffer.depth_cm,

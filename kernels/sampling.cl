@@ -1,7 +1,8 @@
 // Sampling: filtered importance sampling of the diffusion profile around each scattering pixel.
 //
-// Legend: d profile scale in mm; xi_1 -> radius r in mm, xi_2 -> angle; p density of the radius; reach r' with the depth
-// difference. rate = -1 / (3 d) and density = 1 / (4 d) of red, green, blue and the sampled channel.
+// Legend: d profile scale in mm; xi_1 -> radius r in mm, xi_2 -> angle; p density of the radius;
+// reach r' with the depth difference. rate = -1 / (3 d) and density = 1 / (4 d) of red, green, blue
+// and the sampled channel.
 
 #define R2_X 0xC13FA9A9u
 #define R2_Y 0x91E10DA5u
@@ -11,8 +12,9 @@
 #define APPROXIMATE_C 2.5715f
 #define MM_PER_CM 10.0f
 
+
 // [JO20] The first component of the hash of three integers, 16 bits.
-uint pcg3d16(uint x, uint y, uint z)
+word pcg3d16(word x, word y, word z)
 {
     x = x * HASH_MULTIPLIER + HASH_INCREMENT;
     y = y * HASH_MULTIPLIER + HASH_INCREMENT;
@@ -24,203 +26,285 @@ uint pcg3d16(uint x, uint y, uint z)
     return x >> 16;
 }
 
-// e^max(x, -28) and its cube, weighted: w_wide e^x + w_narrow e^3x. With x = -r / (3 d) and weights 1 it is Burley's profile.
-float burley(float x, float w_wide, float w_narrow)
+// w_wide e^x + w_narrow e^3x, x at least -28: with x = -r / (3 d) and weights 1, Burley's profile
+// but for its factor.
+real burley(real x, float w_wide, float w_narrow)
 {
-    const float wide = poly_exp(x < EXPONENT_MIN ? EXPONENT_MIN : x);
+    const real wide = poly_exp(at_least(x, (real)(EXPONENT_MIN)));
     return w_narrow * (wide * wide * wide) + w_wide * wide;
 }
 
 // A non-negative half float from the low 16 bits; no denormals.
-float decode_half(uint bits)
+real decode_half(word bits)
 {
-    return as_float((bits & 0xffffu) << 13) * 0x1p112f;
+    return as_real((bits & 0xffffu) << 13) * 0x1p112f;
 }
 
 // Radius over d for xi_1, given its complement 1 - xi_1 in (0, 1].
-float invert_cdf(float complement)
+real invert_cdf(real complement)
 {
 #if INVERSE_EXACT
-    const float g = poly_cbrt(1.0f + 4.0f * complement * (2.0f * complement + sqrt(1.0f + 4.0f * complement * complement)));
+    const real g = poly_cbrt(1.0f + 4.0f * complement * (2.0f * complement + sqrt(1.0f + 4.0f * complement * complement)));
     return 3.0f * poly_log((1.0f + 1.0f / g + g) / (4.0f * complement));
 #else
     return ((2.0f - APPROXIMATE_C) * (1.0f - complement) - 2.0f) * poly_log(complement);
 #endif
 }
 
-// 0.5 + 0.5 N.M of two packed normals (10 bits a component), in exact integers up to the last step.
-float half_cosine(uint n, uint m)
+// One component of a packed normal, as an integer in [-1023, 1023].
+whole normal_component(word packed, int shift)
 {
-    const int dot_product =
-        ((int)(n & 1023u) * 2 - 1023) * ((int)(m & 1023u) * 2 - 1023) +
-        ((int)((n >> 10) & 1023u) * 2 - 1023) * ((int)((m >> 10) & 1023u) * 2 - 1023) +
-        ((int)((n >> 20) & 1023u) * 2 - 1023) * ((int)((m >> 20) & 1023u) * 2 - 1023);
-    const float cosine = (float)dot_product * (1.0f / 1046529.0f);
-    const float result = 0.5f + 0.5f * cosine;
-    return result < 0.0f ? 0.0f : (result > 1.0f ? 1.0f : result);
+    return as_whole((packed >> shift) & 1023u) * 2 - 1023;
 }
 
-// Scalars only, no vector types: compilers for CPUs then put 8 or 16 lanes into one vector by themselves.
-// setup_texture: half-float texels as two words, red | green << 16 and blue | depth << 16. ratio: of level l, its width (2 l) and
-// height (2 l + 1) over level 0's. _r, _g, _b, _s: red, green, blue and the sampled channel.
-PASS_KERNEL sampling(
+// 0.5 + 0.5 N.M of two packed normals (10 bits a component), in exact integers up to the last step.
+real half_cosine(word n, word m)
+{
+    const whole product = normal_component(n, 0) * normal_component(m, 0) +
+                          normal_component(n, 10) * normal_component(m, 10) +
+                          normal_component(n, 20) * normal_component(m, 20);
+    const real cosine = to_real(product) * (1.0f / 1046529.0f);
+    return at_most(at_least(0.5f + 0.5f * cosine, (real)(0.0f)), (real)(1.0f));
+}
+
+// Level ceil(max(-log2 q, 0) / 2): it exceeds k exactly where q < 4^-k.
+whole find_level(real q, int num_levels)
+{
+    const whole zero = 0, one = 1;
+    const whole level = (q < 1.0f ? one : zero) + (q < 0x1p-2f ? one : zero) + (q < 0x1p-4f ? one : zero) +
+                        (q < 0x1p-6f ? one : zero) + (q < 0x1p-8f ? one : zero);
+    const whole last = num_levels - 1;
+    return level < last ? level : last;
+}
+
+// Where a texel of the setup texture stands, in words; setup_index of common.cl for WIDTH lanes.
+whole find_words(whole level, whole texel_y, whole texel_x, int width, int height)
+{
+    const whole zero = 0;
+    const whole below = level > 0 ? height - (((whole)height) >> (level - 1)) : zero;
+    const whole right = level > 0 ? (whole)width : zero;
+    return 2 * ((texel_y + below) * (width + (width >> 1)) + texel_x + right);
+}
+
+word pack_texels(whole mip, whole texel_y, whole texel_x)
+{
+    return as_word((mip << 28) | (texel_y << 14) | texel_x);
+}
+
+#if TRACED
+#if WIDTH == 1
+#define STORE_ROW(texels) lanes[slot_of_row] = (texels);
+#else
+#define STORE_ROW(texels) vstore8((texels), 0, lanes + slot_of_row);
+#endif
+#define TRACE_LANES(is_traced, active, texels) \
+    if (is_traced) { \
+        STORE_ROW((active) ? (texels) : (word)(0xffffffffu)) \
+        slot_of_row += 32; \
+    }
+#else
+#define TRACE_LANES(is_traced, active, texels)
+#endif
+
+// setup_texture: half-float texels as two words, red | green << 16 and blue | depth << 16. ratio:
+// of level l, its width (2 l) and height (2 l + 1) over level 0's. _r, _g, _b, _s: red, green, blue
+// and the sampled channel.
+__kernel __attribute__((reqd_work_group_size(32 / WIDTH, 1, 1))) void sampling(
     WARP_ARGS, __global const uint *setup_texture, __global const uint *normal, __global const uchar *profile_id,
-    __global const ushort *counts, __global const float2 *velocity, __global half *scattered, const int has_velocity,
+    __global const ushort *counts, __global const float *velocity, __global half *scattered, const int has_velocity,
     const int fixed_count, const uint frame, const int num_levels, __global const float *ratio, const float texels_per_mm_at_cm,
     const float d, const float rate_r, const float rate_g, const float rate_b, const float rate_s, const float density_r,
     const float density_g, const float density_b, const float density_s, const float mip_scale TRACE_ARGS)
 {
-    FIND_PIXEL
+    const uint warp = first_warp + (uint)get_group_id(0);
+    const int steps = warp_steps[warp];
+    if (steps < 0)
+        return;
+    const uint lane = (uint)get_local_id(0) * WIDTH;
     FIND_ROW
-    const uint pixel = inside ? (uint)(y * width + x) : 0u;
-    const uint own = inside ? 2u * setup_index(0, y, x, width, height) : 0u;
-    const float centre_r = decode_half(setup_texture[own]);
-    const float centre_g = decode_half(setup_texture[own] >> 16);
-    const float centre_b = decode_half(setup_texture[own + 1u]);
-    const float centre_depth = decode_half(setup_texture[own + 1u] >> 16);
-    const bool scatters = inside && centre_depth > 0.0f;
-    TRACE(TRACE_COLOUR, inside, 0, y, x)
+    const uint tile = tiles[warp >> 1];
+    const whole zero = 0;
+    const real none = 0.0f;
+#if WIDTH == 1
+    const whole slot = lane_xy[((warp & 1u) << 5) | lane];
+#else
+    const whole slot = convert_int8(vload8(0, lane_xy + (((warp & 1u) << 5) | lane)));
+#endif
+    const whole x = (int)(tile & 0xffffu) * 8 + (slot & 7);
+    const whole y = (int)(tile >> 16) * 8 + (slot >> 3);
+    const whole inside = (x < width) & (y < height);
+    const whole pixel = inside ? y * width + x : zero;
 
-    float4 result = (float4)(0.0f);
+    const whole own = inside ? find_words(zero, y, x, width, height) : zero;
+    const word centre_low = GATHER(uint, setup_texture, own);
+    const word centre_high = GATHER(uint, setup_texture, own + 1);
+    const real centre_r = decode_half(centre_low);
+    const real centre_g = decode_half(centre_low >> 16);
+    const real centre_b = decode_half(centre_high);
+    const real centre_depth = decode_half(centre_high >> 16);
+    const whole scatters = inside & (centre_depth > 0.0f);
+    TRACE_LANES(TRACE_COLOUR, inside, pack_texels(zero, y, x))
+
+    real result_r = none, result_g = none, result_b = none;
+    whole count = zero;
     if (steps > 0) {
-        const uint centre_normal = normal[pixel];
+        const word centre_normal = GATHER(uint, normal, pixel);
 #if NORMAL_WEIGHTS
-        TRACE(TRACE_NORMAL, scatters, 0, y, x)
+        TRACE_LANES(TRACE_NORMAL, scatters, pack_texels(zero, y, x))
 #endif
 #if ADAPTIVE
-        const int count = scatters ? (int)counts[warp * 32u + lane] : 0;
-        const int2 past = reproject(x, y, scatters && has_velocity ? velocity[pixel] : (float2)(0.0f));
-        TRACE(1, scatters, 0, y, x)
-        TRACE(1, scatters && past.x >= 0 && past.x < width && past.y >= 0 && past.y < height, 0, past.y, past.x)
+#if WIDTH == 1
+        count = counts[warp * 32u + lane];
 #else
-        const int count = scatters ? fixed_count : 0;
+        count = convert_int8(vload8(0, counts + warp * 32u + lane));
 #endif
-
-        // Project: texels per mm at this depth, and the mip rule's factor that does not change with the sample.
-        const float texels_per_mm = texels_per_mm_at_cm / (scatters ? centre_depth : 1.0f);
-        const float mip_factor = mip_scale * (float)count / (texels_per_mm * texels_per_mm);
-
-        // Centre reweighting: the share of each profile beyond one texel; samples start beyond the sampled channel's.
-        const float radius_centre = 1.0f / texels_per_mm;
-        const float beyond_r = burley(radius_centre * rate_r, 0.75f, 0.25f);
-        const float beyond_g = burley(radius_centre * rate_g, 0.75f, 0.25f);
-        const float beyond_b = burley(radius_centre * rate_b, 0.75f, 0.25f);
-        const float beyond_s = burley(radius_centre * rate_s, 0.75f, 0.25f);
-#if CENTRE_REWEIGHTING
-        const float unit = 0x1p-24f * beyond_s;
-#else
-        const float unit = 0x1p-24f;
-#endif
-
-        const float middle_x = (float)x + 0.5f;
-        const float middle_y = (float)y + 0.5f;
-        const float right = (float)width - 0.5f;
-        const float bottom = (float)height - 0.5f;
-        const uint start = pcg3d16((uint)x, (uint)y, frame);
-        float sum_r = 0.0f, sum_g = 0.0f, sum_b = 0.0f;
-        float total_r = 0.0f, total_g = 0.0f, total_b = 0.0f;
-
 #if TRACED
-        const int num_turns = steps;
-#else
-        const int num_turns = count;
+        whole past_x = x, past_y = y;
+        if (has_velocity) {
+            const whole at = scatters ? 2 * pixel : zero;
+            past_x = reproject(x, scatters ? GATHER(float, velocity, at) : none);
+            past_y = reproject(y, scatters ? GATHER(float, velocity, at + 1) : none);
+        }
+        TRACE_LANES(1, scatters, pack_texels(zero, y, x))
+        TRACE_LANES(
+            1, scatters & (past_x >= 0) & (past_x < width) & (past_y >= 0) & (past_y < height),
+            pack_texels(zero, past_y, past_x))
 #endif
-        for (int i = 0; i < num_turns; ++i) {
-            const bool active = i < count;
+#else
+        count = fixed_count;
+#endif
+        count = scatters ? count : zero;
+
+        // Project: texels per mm at this depth, and the mip rule's factor that does not change with
+        // the sample.
+        const real texels_per_mm = texels_per_mm_at_cm / (scatters ? centre_depth : (real)(1.0f));
+        const real mip_factor = mip_scale * to_real(count) / (texels_per_mm * texels_per_mm);
+
+        // Centre reweighting: the share of each profile beyond one texel; samples start beyond the
+        // sampled channel's.
+        const real radius_centre = 1.0f / texels_per_mm;
+        const real beyond_r = burley(radius_centre * rate_r, 0.75f, 0.25f);
+        const real beyond_g = burley(radius_centre * rate_g, 0.75f, 0.25f);
+        const real beyond_b = burley(radius_centre * rate_b, 0.75f, 0.25f);
+        const real beyond_s = burley(radius_centre * rate_s, 0.75f, 0.25f);
+#if CENTRE_REWEIGHTING
+        const real unit = 0x1p-24f * beyond_s;
+#else
+        const real unit = 0x1p-24f;
+#endif
+
+        const real middle_x = to_real(x) + 0.5f;
+        const real middle_y = to_real(y) + 0.5f;
+        const real right = (float)width - 0.5f;
+        const real bottom = (float)height - 0.5f;
+        const word start = pcg3d16(as_word(x), as_word(y), (word)(frame));
+        real sum_r = none, sum_g = none, sum_b = none;
+        real total_r = none, total_g = none, total_b = none;
+
+        for (int i = 0; i < steps; ++i) {
+            const whole active = i < count;
 
             // Sample a radius and a direction.
-            const uint index = start + (uint)i;
-            const float complement = (float)(int)(0x1000000u - ((index * R2_X) >> 8)) * unit;
-            const float2 direction = poly_cos_sin(index * R2_Y);
-            float r = d * invert_cdf(complement);
-            r = r < RADIUS_MIN ? RADIUS_MIN : r;
-            float p = burley(r * rate_s, 1.0f, 1.0f) * density_s;
-            p = p < PDF_MIN ? PDF_MIN : p;
+            const word index = start + (uint)i;
+            const real complement = to_real(as_whole(0x1000000u - ((index * R2_X) >> 8))) * unit;
+            real cosine, sine;
+            poly_cos_sin(index * R2_Y, &cosine, &sine);
+            const real r = at_least(d * invert_cdf(complement), (real)(RADIUS_MIN));
+            const real p = at_least(burley(r * rate_s, 1.0f, 1.0f) * density_s, (real)(PDF_MIN));
 
             // Find the texel; coordinates are clamped to the viewport's texel centres.
-            const float reach_texels = r * texels_per_mm;
-            float at_x = middle_x + reach_texels * direction.x;
-            float at_y = middle_y + reach_texels * direction.y;
-            at_x = at_x < 0.5f ? 0.5f : at_x;
-            at_y = at_y < 0.5f ? 0.5f : at_y;
-            at_x = at_x > right ? right : at_x;
-            at_y = at_y > bottom ? bottom : at_y;
-            const int texel_x = (int)at_x;
-            const int texel_y = (int)at_y;
-
-            // Choose the level: l = ceil(max(-log2 q, 0) / 2) exceeds k exactly where q < 4^-k.
+            const real reach_texels = r * texels_per_mm;
+            const real at_x = at_most(at_least(middle_x + reach_texels * cosine, (real)(0.5f)), right);
+            const real at_y = at_most(at_least(middle_y + reach_texels * sine, (real)(0.5f)), bottom);
+            const whole texel_x = to_whole(at_x);
+            const whole texel_y = to_whole(at_y);
 #if MIP_RULE == 0
-            const uint level = 0u;
-            const int level_x = texel_x, level_y = texel_y;
+            const whole level = zero, level_x = texel_x, level_y = texel_y;
 #else
 #if MIP_RULE == 1
-            const float q = p * mip_factor;  // Eq 5.12
+            const whole level = find_level(p * mip_factor, num_levels);  // Eq 5.12
 #else
-            const float q = p * mip_factor / r;  // [KC08] samples per texel of level 0
+            const whole level = find_level(p * mip_factor / r, num_levels);  // [KC08] samples per texel of level 0
 #endif
-            const int finer = (q < 1.0f) + (q < 0x1p-2f) + (q < 0x1p-4f) + (q < 0x1p-6f) + (q < 0x1p-8f);
-            const uint level = (uint)(finer < num_levels ? finer : num_levels - 1);
-            const int level_x = (int)(at_x * ratio[2u * level]);
-            const int level_y = (int)(at_y * ratio[2u * level + 1u]);
+            const whole level_x = to_whole(at_x * GATHER(float, ratio, 2 * level));
+            const whole level_y = to_whole(at_y * GATHER(float, ratio, 2 * level + 1));
 #endif
 
             // Fetch.
-            const uint at = 2u * setup_index(level, level_y, level_x, width, height);
-            const uint red_green = setup_texture[at];
-            const uint blue_depth = setup_texture[at + 1u];
-            TRACE(TRACE_COLOUR, active, level, level_y, level_x)
-            const uint fetched = (uint)(texel_y * width + texel_x);
-            float common = (active & (profile_id[fetched] > 0)) ? 1.0f : 0.0f;
+            const whole at = find_words(level, level_y, level_x, width, height);
+            const word low = GATHER(uint, setup_texture, at);
+            const word high = GATHER(uint, setup_texture, at + 1);
+            TRACE_LANES(TRACE_COLOUR, active, pack_texels(level, level_y, level_x))
+            const whole fetched = texel_y * width + texel_x;
+            const whole id = to_whole(GATHER(uchar, profile_id, fetched));
+            real common = (active & (id > 0)) ? 1.0f / p : none;
 #if NORMAL_WEIGHTS
-            common *= sqrt(half_cosine(normal[fetched], centre_normal));
-            TRACE(TRACE_NORMAL, active, 0, texel_y, texel_x)
+            common *= sqrt(half_cosine(GATHER(uint, normal, fetched), centre_normal));
+            TRACE_LANES(TRACE_NORMAL, active, pack_texels(zero, texel_y, texel_x))
 #endif
-            TRACE(TRACE_PROFILE_ID, active, 0, texel_y, texel_x)
-            common /= p;
+            TRACE_LANES(TRACE_PROFILE_ID, active, pack_texels(zero, texel_y, texel_x))
 
-            // Weigh: each channel's profile at the distance in space, over the density that drew the sample.
+            // Weigh: each channel's profile at the distance in space, over the density that drew
+            // the sample.
 #if BILATERAL
-            const float dz = (decode_half(blue_depth >> 16) - centre_depth) * MM_PER_CM;
-            const float reach = sqrt(r * r + dz * dz);
+            const real dz = (decode_half(high >> 16) - centre_depth) * MM_PER_CM;
+            const real reach = sqrt(r * r + dz * dz);
 #else
-            const float reach = r;
+            const real reach = r;
 #endif
-            const float weight_r = burley(reach * rate_r, 1.0f, 1.0f) * density_r * common;
-            const float weight_g = burley(reach * rate_g, 1.0f, 1.0f) * density_g * common;
-            const float weight_b = burley(reach * rate_b, 1.0f, 1.0f) * density_b * common;
-            sum_r += weight_r * decode_half(red_green);
-            sum_g += weight_g * decode_half(red_green >> 16);
-            sum_b += weight_b * decode_half(blue_depth);
+            const real weight_r = burley(reach * rate_r, 1.0f, 1.0f) * density_r * common;
+            const real weight_g = burley(reach * rate_g, 1.0f, 1.0f) * density_g * common;
+            const real weight_b = burley(reach * rate_b, 1.0f, 1.0f) * density_b * common;
+            sum_r += weight_r * decode_half(low);
+            sum_g += weight_g * decode_half(low >> 16);
+            sum_b += weight_b * decode_half(high);
             total_r += weight_r;
             total_g += weight_g;
             total_b += weight_b;
         }
 
-        if (scatters) {
 #if SELF_NORMALISED
-            result.x = total_r > 0.0f ? sum_r / total_r : centre_r;
-            result.y = total_g > 0.0f ? sum_g / total_g : centre_g;
-            result.z = total_b > 0.0f ? sum_b / total_b : centre_b;
+        result_r = total_r > 0.0f ? sum_r / total_r : centre_r;
+        result_g = total_g > 0.0f ? sum_g / total_g : centre_g;
+        result_b = total_b > 0.0f ? sum_b / total_b : centre_b;
 #if CENTRE_REWEIGHTING
-            result.x += (centre_r - result.x) * (1.0f - beyond_r);
-            result.y += (centre_g - result.y) * (1.0f - beyond_g);
-            result.z += (centre_b - result.z) * (1.0f - beyond_b);
+        result_r += (centre_r - result_r) * (1.0f - beyond_r);
+        result_g += (centre_g - result_g) * (1.0f - beyond_g);
+        result_b += (centre_b - result_b) * (1.0f - beyond_b);
 #endif
 #else
-            result.x = sum_r / (float)count;
-            result.y = sum_g / (float)count;
-            result.z = sum_b / (float)count;
+        const real num_samples = to_real(count);
+        result_r = sum_r / num_samples;
+        result_g = sum_g / num_samples;
+        result_b = sum_b / num_samples;
 #if CENTRE_REWEIGHTING
-            // The samples were drawn from the part of the profile beyond the centre texel.
-            result.x = result.x * beyond_s + centre_r * (1.0f - beyond_r);
-            result.y = result.y * beyond_s + centre_g * (1.0f - beyond_g);
-            result.z = result.z * beyond_s + centre_b * (1.0f - beyond_b);
+        // The samples were drawn from the part of the profile beyond the centre texel.
+        result_r = result_r * beyond_s + centre_r * (1.0f - beyond_r);
+        result_g = result_g * beyond_s + centre_g * (1.0f - beyond_g);
+        result_b = result_b * beyond_s + centre_b * (1.0f - beyond_b);
 #endif
 #endif
-            result.w = (float)count;
-        }
     }
-    if (inside)
-        store_half(scattered, pixel, result);
-    TRACE(1, inside, 0, y, x)
+
+    // Store colour and count, texel by texel.
+    TRACE_LANES(1, inside, pack_texels(zero, y, x))
+    const whole target = inside ? pixel : (whole)(-1);
+    const real kept = to_real(count);
+#if WIDTH == 1
+    if (target >= 0)
+        store_half(scattered, target, count > 0 ? (float4)(result_r, result_g, result_b, kept) : (float4)(0.0f));
+#else
+    float red[8], green[8], blue[8], samples[8];
+    int targets[8];
+    vstore8(result_r, 0, red);
+    vstore8(result_g, 0, green);
+    vstore8(result_b, 0, blue);
+    vstore8(kept, 0, samples);
+    vstore8(target, 0, targets);
+    for (int k = 0; k < 8; ++k) {
+        if (targets[k] >= 0)
+            store_half(
+                scattered, targets[k], samples[k] > 0.0f ? (float4)(red[k], green[k], blue[k], samples[k]) : (float4)(0.0f));
+    }
+#endif
 }

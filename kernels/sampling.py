@@ -1,13 +1,15 @@
-"""Sampling pass: filtered importance sampling around each scattering pixel, with a fixed or an estimated sample count.
+"""Sampling pass: filtered importance sampling around each scattering pixel, with a fixed or an
+estimated sample count.
 
-Facts sheet 2.3 to 2.7. The twin of sampling.cl and estimate.cl, operation by operation. Left out of the engine's estimator: its
-division by 0.99995, boundary colour bleed (there is one profile) and the opacity fade.
+Facts sheet 2.3 to 2.7. The twin of sampling.cl and estimate.cl, operation by operation. Left out of
+the engine's estimator: its division by 0.99995, boundary colour bleed (there is one profile) and
+the opacity fade.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -22,6 +24,9 @@ from kernels.sequence import pcg3d16, r2
 from kernels.setup import texels
 from kernels.update import has_history, history_names, read_history, reproject
 from traces.texture import INACTIVE_TEXEL, pack_texel
+
+if TYPE_CHECKING:
+    from kernels.pipeline import Pipeline
 
 _F = np.float32
 _ONE = _F(1)
@@ -39,9 +44,10 @@ Texels = npt.NDArray[np.uint32]
 class Constants:
     """The pass's numbers that one picture fixes, as float32.
 
-    texels_per_mm_at_cm: texels per mm at a depth of 1 cm. d: the sampled channel's profile scale, mm. rate, density: -1 / (3 d), 1/mm,
-    and 1 / (4 d), 1/mm, of red, green, blue and the sampled channel. mip_scale: the mip rule's factor. ratio: (num_levels, 2), width and
-    height of each level over those of level 0.
+    texels_per_mm_at_cm: texels per mm at a depth of 1 cm. d: the sampled channel's profile scale,
+    mm. rate, density: -1 / (3 d), 1/mm, and 1 / (4 d), 1/mm, of red, green, blue and the sampled
+    channel. mip_scale: the mip rule's factor. ratio: (num_levels, 2), width and height of each
+    level over those of level 0.
     """
 
     texels_per_mm_at_cm: np.float32
@@ -56,7 +62,8 @@ class Constants:
         """The constants for a frame. projection_x: 1 / tan(fov_x / 2)."""
         profile = method.profile
         d = np.array([*profile.d_mm, profile.d_sampled_mm])
-        # Facts sheet 2.5: UV per mm at depth z is 0.05 M / z, or M / (6 z) in the engine before its correction.
+        # Facts sheet 2.5: UV per mm at depth z is 0.05 M / z, or M / (6 z) in the engine before its
+        # correction.
         step = 0.05 if method.scale == "physical" else 1.0 / 6.0
         if method.mip_rule == "textbook":
             mip_scale = 1.0 / (2.0 * np.pi)
@@ -80,12 +87,17 @@ def accesses(method: Method, frame: int) -> tuple[Access, ...]:
     colour = "colour" in method.planes
     normal = "normal" in method.planes and method.normal_weights
     planes = [
-        Access("setup", in_loop=True, arithmetic=(("int", 14), ("fp32", 46), ("sfu", 5)), num_outstanding=0)
+        Access(
+            "setup",
+            in_loop=True,
+            arithmetic=(("int", 14), ("fp32", 46), ("sfu", 5)),
+            num_outstanding=0,
+        )
     ] * colour
     planes += [Access("normal", in_loop=True, arithmetic=(("int", 3),), num_outstanding=1)] * normal
-    planes += [
-        Access("profile_id", in_loop=True, arithmetic=(("int", 2),), num_outstanding=2)
-    ] * ("profile_id" in method.planes)
+    planes += [Access("profile_id", in_loop=True, arithmetic=(("int", 2),), num_outstanding=2)] * (
+        "profile_id" in method.planes
+    )
     found = [Access("setup", arithmetic=(("int", 12),))] * colour
     found += [Access("normal", subsurface_only=True, arithmetic=(("int", 2),))] * normal
     if method.adaptive:
@@ -122,7 +134,9 @@ def estimate_reference(
 
 
 def estimate_count(mean_count: Any, variance: Any, method: Method) -> Any:
-    """The next frame's count before rounding, clamped to [b_min, b_max]; float32. Facts sheet 3.2."""
+    """The next frame's count before rounding, clamped to [b_min, b_max]; float32. Facts sheet
+    3.2.
+    """
     s0 = _F(method.sigma0_sq)
     if method.rule == "paper":
         delta = (variance - s0) / s0 * mean_count * _F(k_minus_1(method))
@@ -133,12 +147,16 @@ def estimate_count(mean_count: Any, variance: Any, method: Method) -> Any:
 
 
 def k_minus_1(method: Method) -> float:
-    """k - 1 for the simple moving average of k = 2 / alpha - 1 frames that the history's alpha stands for."""
+    """k - 1 for the simple moving average of k = 2 / alpha - 1 frames that the history's alpha
+    stands for.
+    """
     return 2.0 / method.alpha - 2.0
 
 
 def burley(x: Any, w_wide: np.float32 = _ONE, w_narrow: np.float32 = _ONE) -> Any:
-    """w_wide e^x + w_narrow e^3x, x at least -28: with x = -r / (3 d) and weights 1, Burley's profile but for its factor."""
+    """w_wide e^x + w_narrow e^3x, x at least -28: with x = -r / (3 d) and weights 1, Burley's
+    profile but for its factor.
+    """
     wide = poly_exp(np.maximum(x, _EXPONENT_MIN))
     return w_narrow * (wide * wide * wide) + w_wide * wide
 
@@ -162,9 +180,45 @@ def half_cosine(n: Any, m: Any) -> Any:
 
 
 def find_level(q: Any, num_levels: int) -> Any:
-    """ceil(max(-log2 q, 0) / 2), at most 5 and the last level: it exceeds k exactly where q < 4^-k. int32."""
+    """ceil(max(-log2 q, 0) / 2), at most 5 and the last level: it exceeds k exactly where q < 4^-k.
+    int32.
+    """
     finer = sum((q < _F(4.0**-k)).astype(np.int32) for k in range(5))
     return np.minimum(finer, num_levels - 1)
+
+
+def arguments(pipeline: Pipeline, level: int, frame: int) -> list[Any]:
+    """The kernel's arguments between the warp's and the trace's."""
+    names = ("setup", "normal", "profile_id", "counts", "velocity", "scattered")
+    constants = pipeline.constants
+    return [
+        *(pipeline.buffers[name] for name in names),
+        pipeline.has_velocity,
+        np.int32(pipeline.method.num_samples),
+        np.uint32(frame),
+        np.int32(pipeline.num_levels),
+        pipeline.buffers["ratio"],
+        constants.texels_per_mm_at_cm,
+        constants.d,
+        *constants.rate,
+        *constants.density,
+        constants.mip_scale,
+    ]
+
+
+def estimate_arguments(pipeline: Pipeline, frame: int) -> list[Any]:
+    """The same of the estimate kernel, whose reads the sampling kernel traces as its own."""
+    names = ("setup", "velocity", history_names(frame)[0], "counts")
+    method = pipeline.method
+    return [
+        *(pipeline.buffers[name] for name in names),
+        pipeline.has_velocity,
+        np.float32(method.sigma0_sq),
+        np.float32(method.kappa),
+        np.float32(k_minus_1(method)),
+        np.float32(method.b_min),
+        np.float32(method.b_max),
+    ]
 
 
 def reference(
@@ -176,7 +230,9 @@ def reference(
     frame: int,
     counts: npt.NDArray[np.int32],
 ) -> list[Texels]:
-    """Write `scattered`; the texels of each access, those of the loop (num_steps, num_warps, 32)."""
+    """Write `scattered`; the texels of each access, those of the loop (num_steps, num_warps,
+    32).
+    """
     from kernels.reference import scatter
 
     x, y = grid.lanes
@@ -207,7 +263,9 @@ def reference(
 
         at = [
             np.clip(
-                middle.astype(_F) + _F(0.5) + r * texels_per_mm * direction, _F(0.5), _F(size) - _F(0.5)
+                middle.astype(_F) + _F(0.5) + r * texels_per_mm * direction,
+                _F(0.5),
+                _F(size) - _F(0.5),
             )
             for middle, direction, size in ((x, cosine, grid.width), (y, sine, grid.height))
         ]
@@ -217,16 +275,20 @@ def reference(
         else:
             q = p * mip_factor / r if method.mip_rule == "textbook" else p * mip_factor
             level = find_level(q, num_levels)
-        level_x, level_y = ((a * constants.ratio[level, k]).astype(np.int32) for k, a in enumerate(at))
+        level_x, level_y = (
+            (a * constants.ratio[level, k]).astype(np.int32) for k, a in enumerate(at)
+        )
         colour = np.zeros((*x.shape, 4), _F)
         for k in range(num_levels):
             here = level == k
             colour[here] = textures["setup"][k][level_y[here], level_x[here]]
 
-        common = (active & (textures["profile_id"][texel_y, texel_x] > 0)).astype(_F)
+        counts_here = active & (textures["profile_id"][texel_y, texel_x] > 0)
+        common = np.where(counts_here, _ONE / p, _F(0))
         if method.normal_weights:
-            common = common * np.sqrt(half_cosine(textures["normal"][texel_y, texel_x], centre_normal))
-        common = common / p
+            common = common * np.sqrt(
+                half_cosine(textures["normal"][texel_y, texel_x], centre_normal)
+            )
         reach = r
         if method.bilateral:
             dz = (colour[..., 3] - centre[..., 3]) * _MM_PER_CM

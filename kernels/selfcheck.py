@@ -1,4 +1,6 @@
-"""Holds a device to the NumPy reference on a small frame: the number of lane fetches that differ."""
+"""Holds a device to the NumPy reference on a small frame: the number of lane fetches that
+differ.
+"""
 
 from __future__ import annotations
 
@@ -16,7 +18,9 @@ _counted: dict[tuple[Device, Method], int] = {}
 
 
 def small_gbuffer(width: int = 44, height: int = 27, depth_cm: float = 30.0) -> GBuffer:
-    """A tilted, wavy disc with a hard shadow edge on an empty background; `depth_cm` sets the texels per mm."""
+    """A tilted, wavy disc with a hard shadow edge on an empty background; `depth_cm` sets the
+    texels per mm.
+    """
     y, x = np.mgrid[0:height, 0:width].astype(np.float32)
     disc = ((x - width / 2) / (width / 2.2)) ** 2 + ((y - height / 2) / (height / 2.1)) ** 2 < 1
     depth = depth_cm * (1 + 0.05 * (x / width - 0.5) + 0.03 * (y > height * 0.7))
@@ -37,7 +41,8 @@ def small_gbuffer(width: int = 44, height: int = 27, depth_cm: float = 30.0) -> 
 
 
 def count_differences(device: Device, method: Method) -> int:
-    """Lane fetches of a small frame (adaptive: of two) that differ between device and reference; 0 = the device complies.
+    """Lane fetches of a small frame (adaptive: of two) that differ between device and reference; 0
+    = the device complies.
 
     A launch whose rows are laid out differently counts with every lane of the reference.
     """

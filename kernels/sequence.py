@@ -1,7 +1,8 @@
 """The sample points: Roberts' R2 sequence in fixed point, started at a hash of pixel and frame.
 
-[R18] Roberts, The Unreasonable Effectiveness of Quasirandom Sequences, 2018; [JO20] Jarzynski and Olano, Hash Functions for GPU
-Rendering, JCGT 9(3), 2020. Fixed point because a float32 fraction of an index near 65 000 keeps only 8 bits.
+[R18] Roberts, The Unreasonable Effectiveness of Quasirandom Sequences, 2018; [JO20] Jarzynski and
+Olano, Hash Functions for GPU Rendering, JCGT 9(3), 2020. Fixed point because a float32 fraction of
+an index near 65 000 keeps only 8 bits.
 """
 
 from __future__ import annotations

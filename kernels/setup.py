@@ -1,8 +1,8 @@
-"""Set-up pass: G-buffer and light in, setup texture (irradiance, depth) and profile-id cache out."""
+"""Set-up pass: G-buffer and light in, setup texture (irradiance, depth) and profile ids out."""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -10,21 +10,32 @@ import numpy.typing as npt
 from kernels import resources
 from kernels.access import Access
 from kernels.grid import Grid
+from kernels.method import Method
 from traces.texture import pack_texel
 
-# Arithmetic counts are assumed: from reading the kernel, not from machine code.
-ACCESSES = (
-    Access("gbuffer_id", arithmetic=(("int", 12),)),
-    Access("depth", num_outstanding=1),
-    Access("scene_light", subsurface_only=True, arithmetic=(("int", 3),), num_outstanding=0),
-    Access("setup", "store", arithmetic=(("fp32", 4), ("int", 6)), num_outstanding=0),
-    Access("profile_id", "store", arithmetic=(("int", 2),)),
-)
+if TYPE_CHECKING:
+    from kernels.pipeline import Pipeline
 
 
-def reference(
-    grid: Grid, textures: dict[str, Any]
-) -> list[npt.NDArray[np.uint32]]:
+def accesses(method: Method, frame: int) -> tuple[Access, ...]:
+    """The pass's accesses, the same for every method and frame."""
+    # Arithmetic counts are assumed: from reading the kernel, not from machine code.
+    return (
+        Access("gbuffer_id", arithmetic=(("int", 12),)),
+        Access("depth", num_outstanding=1),
+        Access("scene_light", subsurface_only=True, arithmetic=(("int", 3),), num_outstanding=0),
+        Access("setup", "store", arithmetic=(("fp32", 4), ("int", 6)), num_outstanding=0),
+        Access("profile_id", "store", arithmetic=(("int", 2),)),
+    )
+
+
+def arguments(pipeline: Pipeline, level: int, frame: int) -> list[Any]:
+    """The kernel's arguments between the warp's and the trace's."""
+    names = ("scene_light", "depth", "gbuffer_id", "setup", "profile_id")
+    return [pipeline.buffers[name] for name in names]
+
+
+def reference(grid: Grid, textures: dict[str, Any]) -> list[npt.NDArray[np.uint32]]:
     """Write `setup` (its level 0) and `profile_id`; the texels of each access, (num_warps, 32)."""
     mask = (textures["gbuffer_id"] > 0) & (textures["depth"] > 0)
     level = textures["scene_light"].astype(np.float32)

@@ -1,5 +1,5 @@
-// Update: blend this frame into the history (mean count, depth, variance of the mean, mean) and pass the colour on.
-// The tracked scalar is the luminance of the colour's 1/2.2 power. [Xie20]
+// Update: blend this frame into the history (mean count, depth, variance of the mean, mean) and
+// pass the colour on. The tracked scalar is the luminance of the colour's 1/2.2 power. [Xie20]
 PASS_KERNEL update(
     WARP_ARGS, __global const half *scattered, __global const float2 *velocity, __global const float *depth,
     __global const half *old_history, __global half *resolved, __global half *history, const int has_velocity,
@@ -13,7 +13,8 @@ PASS_KERNEL update(
     const bool scatters = colour.w > 0.0f;
     float4 blended = (float4)(0.0f);
     if (steps > 0) {
-        const int2 past = reproject(x, y, scatters && has_velocity ? velocity[pixel] : (float2)(0.0f));
+        const float2 moved = scatters && has_velocity ? velocity[pixel] : (float2)(0.0f);
+        const int2 past = (int2)(reproject(x, moved.x), reproject(y, moved.y));
         const bool on_screen = scatters && past.x >= 0 && past.x < width && past.y >= 0 && past.y < height;
         TRACE(1, scatters, 0, y, x)
         TRACE(1, scatters, 0, y, x)

@@ -1,13 +1,15 @@
-"""Update pass of the adaptive method: this frame into the history (mean count, depth, variance of the mean, mean).
+"""Update pass of the adaptive method: this frame into the history (mean count, depth, variance of
+the mean, mean).
 
-Exponential moving mean and variance of the luminance of the colour's 1/2.2 power, [Xie20] and facts sheet 3.1; the target variance
-and this frame alone where there is no history. The engine's second read of the result and its bilinear read of the lighting
-belong to its control variate, which this method does not have.
+Exponential moving mean and variance of the luminance of the colour's 1/2.2 power, [Xie20] and facts
+sheet 3.1; the target variance and this frame alone where there is no history. The engine's second
+read of the result and its bilinear read of the lighting belong to its control variate, which this
+method does not have.
 """
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -20,6 +22,9 @@ from kernels.polynomial import poly_gamma
 from kernels.setup import texels
 from traces.texture import INACTIVE_TEXEL, pack_texel
 
+if TYPE_CHECKING:
+    from kernels.pipeline import Pipeline
+
 _F = np.float32
 _LUMINANCE = (_F(0.3), _F(0.59), _F(0.11))
 
@@ -29,7 +34,7 @@ def history_names(frame: int) -> tuple[str, str]:
     return f"history_{(frame + 1) % 2}", f"history_{frame % 2}"
 
 
-def accesses(frame: int) -> tuple[Access, ...]:
+def accesses(method: Method, frame: int) -> tuple[Access, ...]:
     """The pass's accesses; arithmetic counts are assumed, from reading the kernel."""
     old, new = history_names(frame)
     return (
@@ -43,13 +48,17 @@ def accesses(frame: int) -> tuple[Access, ...]:
 
 
 def reproject(grid: Grid, textures: dict[str, Any], active: Any) -> tuple[Any, Any, Any]:
-    """(x, y, whether on screen) of each lane's pixel in the previous frame; no movement for inactive lanes."""
+    """(x, y, whether on screen) of each lane's pixel in the previous frame; no movement for
+    inactive lanes.
+    """
     x, y = grid.lanes
     velocity = textures.get("velocity")
-    moved = np.zeros((*x.shape, 2), _F) if velocity is None else grid.gather(velocity)
+    moved: Any = np.zeros((*x.shape, 2), _F) if velocity is None else grid.gather(velocity)
     moved = np.where(active[..., None], moved, _F(0))
     past = [
-        np.floor(np.clip(at.astype(_F) + _F(0.5) + moved[..., k], _F(-1), _F(32768))).astype(np.int32)
+        np.floor(np.clip(at.astype(_F) + _F(0.5) + moved[..., k], _F(-1), _F(32768))).astype(
+            np.int32
+        )
         for k, at in enumerate((x, y))
     ]
     on_screen = (past[0] >= 0) & (past[0] < grid.width) & (past[1] >= 0) & (past[1] < grid.height)
@@ -66,6 +75,18 @@ def has_history(history: Any, depth: Any) -> Any:
     """Whether history texels belong to a surface at this depth: within a tenth of it."""
     near = np.abs(history[..., 1] - depth) <= _F(0.1) * depth
     return (history[..., 1] > 0) & near
+
+
+def arguments(pipeline: Pipeline, level: int, frame: int) -> list[Any]:
+    """The kernel's arguments between the warp's and the trace's."""
+    old, new = history_names(frame)
+    names = ("scattered", "velocity", "depth", old, "resolved", new)
+    return [
+        *(pipeline.buffers[name] for name in names),
+        pipeline.has_velocity,
+        np.float32(pipeline.method.alpha),
+        np.float32(pipeline.method.sigma0_sq),
+    ]
 
 
 def reference(

@@ -115,12 +115,14 @@ def test_every_dependency_is_pinned_and_pycachesim_is_not_among_them():
 
 def test_every_package_folder_and_data_file_is_installed():
     setuptools = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]
-    folders = {".".join(p.relative_to(ROOT).parent.parts) for r in ROOMS for p in sources(r)}
-    assert folders == set(setuptools["packages"])
+    packages = [
+        path.parent for room in ROOMS for path in sources(room) if path.name == "__init__.py"
+    ]
+    assert {".".join(p.relative_to(ROOT).parts) for p in packages} == set(setuptools["packages"])
     shipped = setuptools["package-data"]
     for path in repository_files():
         parts = path.relative_to(ROOT).parts
-        if parts[0] in ROOMS and path.suffix not in (".py", ".md"):
+        if path.parent in packages and path.suffix not in (".py", ".md"):
             patterns = shipped.get(".".join(parts[:-1]), [])
             assert any(path.match(pattern) for pattern in patterns), path
 

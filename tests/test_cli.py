@@ -1,4 +1,4 @@
-"""The command line: exit codes, one line for bad input, JSON as designed, and nothing half-written."""
+"""The command line: exit codes, one line for bad input, JSON as designed, whole outputs."""
 
 import json
 import os
@@ -219,9 +219,7 @@ def test_run_takes_overrides_and_writes_json_and_csv(folder: Path, trace_file: P
     assert sorted(p.name for p in folder.iterdir()) == ["big.json", "by.csv", "real.json"]
 
 
-def test_run_counts_a_lane_address_file(
-    folder: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_run_counts_a_lane_address_file(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     addresses = np.arange(4 * 3 * 32, dtype=np.uint64).reshape(4, 3, 32) * np.uint64(4) + 4096
     np.savez(
         "lanes.npz",
@@ -344,9 +342,7 @@ def test_the_command_line_loads_nothing_heavy_for_its_help() -> None:
     ],
     ids=lambda a: a[0],
 )
-def test_saved_traces_need_no_opencl(
-    arguments: list[str], folder: Path, trace_file: Path
-) -> None:
+def test_saved_traces_need_no_opencl(arguments: list[str], folder: Path, trace_file: Path) -> None:
     arguments = [str(trace_file) if a == "T" else a for a in arguments]
     done = python(
         "import sys; sys.modules['pyopencl'] = None;"  # any import of it now fails
@@ -374,9 +370,7 @@ def interrupt(arguments: list[str], ready: Path | None = None) -> tuple[int, str
     return child.returncode, error
 
 
-def test_an_interrupted_sweep_leaves_nothing_half_written(
-    folder: Path, tmp_path: Path
-) -> None:
+def test_an_interrupted_sweep_leaves_nothing_half_written(folder: Path, tmp_path: Path) -> None:
     trace = tmp_path / "big.parquet"
     write_parquet(stream(20000), trace)
     axis = "l1.capacity=" + ",".join(f"{24 * k}KiB" for k in range(1, 400))
@@ -398,7 +392,10 @@ def test_an_interrupted_recording_leaves_nothing_half_written(folder: Path) -> N
 
 
 def test_no_space_on_the_disk_is_one_line_and_exit_code_1(
-    folder: Path, trace_file: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    folder: Path,
+    trace_file: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     def full(*_: object, **__: object) -> None:
         raise OSError(28, "No space left on device")

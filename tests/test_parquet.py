@@ -280,7 +280,7 @@ def rewrite(
         ({"textures": [{"name": "a", "format": "R8", "width": 0, "height": 48}]}, "width 0"),
         ({"textures": [{"name": "a", "format": "R8", "width": "64", "height": 48}]}, "0.width"),
         ({"textures": [{"name": "a", "format": "R8", "width": 32, "height": 48}]}, "x below 32"),
-        ({"textures": []}, "columns"),
+        ({"textures": []}, "a lane-address trace has texture -1"),
         (
             {"instructions": [{"pass_name": "gather", "texture": 1}]},
             "texture 1: allowed are 0 to 0",

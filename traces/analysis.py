@@ -95,9 +95,9 @@ def footprint(
     texture_of = np.array([i.texture for i in trace.instructions], np.int64)
     start_of = starts[:-1].reshape(sizes.shape)
     for chunk, addresses in _blocks(trace, address_map):
-        texture = texture_of[chunk.instruction]
+        textures = texture_of[chunk.instruction]
         sector = np.uint64(sector_bytes)
-        _mark(addresses, chunk.lanes, texture, sector, first, start_of, touched)
+        _mark(addresses, chunk.lanes, textures, sector, first, start_of, touched)
     records = []
     for index, texture in enumerate(trace.textures):
         for mip in range(texture.num_mips):
@@ -182,8 +182,8 @@ class _Stack:
         if 2 * lines > len(self.keys):
             keys, last, row = self.keys, self.last, self.row
             self._resize_table(1 << (2 * lines - 1).bit_length())
-            used = last > 0
-            _insert(keys[used], last[used], row[used], self.keys, self.last, self.row)
+            held = last > 0
+            _insert(keys[held], last[held], row[held], self.keys, self.last, self.row)
         if lines > len(self.histogram):
             self.histogram = np.concatenate([self.histogram, np.zeros(lines, np.int64)])
         if self.time + num_requests >= len(self.tree):

@@ -1,4 +1,4 @@
-"""Row groups of the native file: chunks cut and merged to a good size, as Parquet tables, and back."""
+"""Row groups of the native file: chunks cut and merged to a good size, as tables, and back."""
 
 from __future__ import annotations
 
@@ -46,10 +46,11 @@ class RowGroups:
         fields = [pa.field(name, kind, nullable=False) for name, kind in _COLUMNS.items()]
         self.schema = pa.schema(fields + [pa.field(name, pa.binary()) for name in self.planes])
         # Width and height of mip 0 of each instruction's texture, by which the lanes are predicted.
-        self._sizes = np.zeros((len(trace.instructions), 2), np.uint32)
-        if not trace.is_lane_address:
-            held = [trace.textures[instruction.texture] for instruction in trace.instructions]
-            self._sizes[:] = [(texture.width, texture.height) for texture in held]
+        held = (
+            [] if trace.is_lane_address else [trace.textures[i.texture] for i in trace.instructions]
+        )
+        sizes = [(texture.width, texture.height) for texture in held]
+        self._sizes = np.array(sizes, np.uint32).reshape(-1, 2)
 
     def table(self, chunk: Chunk) -> Any:
         """The `pa.Table` of a chunk."""

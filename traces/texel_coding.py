@@ -77,7 +77,7 @@ def _cost(lanes: Any, row: Any, reference: Any, size: Any, from_size: Any) -> An
     the lane before.
     """
     low = u32(0x3FFF)
-    cost, tried = 0, 0
+    cost, tried = np.int64(0), 0
     before = INACTIVE_TEXEL
     for lane in range(WARP_SIZE):
         texel = lanes[row, lane]
@@ -110,7 +110,8 @@ def _choose(lanes: Any, begin: Any, end: Any, row: Any, instruction: Any, sizes:
     habit: (3,) int64 of the row's instruction: its last choice, what that cost, and for how many
     rows it has stood. While it costs about as usual, the others are not looked at.
     """
-    best, best_cost = PREVIOUS_LANE, np.int64(1) << 60
+    best: Any = PREVIOUS_LANE
+    best_cost = np.int64(1) << 60
     habit[2] += 1
     for attempt in range(NUM_PREDICTORS + 1):
         code = habit[0] if attempt == 0 else attempt - 1
@@ -237,7 +238,7 @@ def decode_texels(mask: Any, predictor: Any, present: Any, offsets: Any, data: A
                     if reference == row or predictor[reference] > _LAST_BACKWARD:
                         return row
                 bits = mask[row]
-                num_active = 0
+                num_active: Any = 0
                 for lane in range(WARP_SIZE):
                     num_active += np.int64((bits >> u32(lane)) & u32(1))
                 # Put the planes together.
