@@ -28,8 +28,8 @@ _POLYNOMIALS = {
     7: 0b0000011,
     8: 0b00011101,
 }
-#: Bits of the block number that IPOLY looks at (facts sheet 3.2); 40 for the degrees GPGPU-Sim has no table for.
-_IPOLY_BITS = {4: 16, 5: 19, 6: 24}
+#: How many low bits of the block number IPOLY looks at (facts sheet 3.2: "up to" bit 16, 19, 24); 40 for the degrees GPGPU-Sim has no table for.
+_IPOLY_BITS = {4: 17, 5: 20, 6: 25}
 
 # Kinds of index function.
 MASK, MODULO, TABLE, RANDOM = range(4)

@@ -7,6 +7,7 @@ sources beside the values.
 
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import Annotated, Any, Literal, Self
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
@@ -38,6 +39,7 @@ WritePolicy = Literal["read-only", "write-through", "write-back", "write-evict",
 WriteAllocate = Literal["none", "write-allocate", "fetch-on-write", "lazy-fetch-on-read"]
 FetchPath = Literal["texture", "readonly", "global"]
 MAX_SECTORS_PER_LINE = 8
+MAX_IPOLY_SLICES = 256
 
 
 class _Model(BaseModel):
@@ -172,6 +174,14 @@ class L2(CacheLevel):
                 f"partition_hash = 'xor' with num_channels = {self.num_channels}: "
                 "needs a power of two"
             )
+        # The hash spreads over the next power of two of channels (facts sheet 3.4, mode 2).
+        entries = (1 << (self.num_channels - 1).bit_length()) * self.slices_per_channel
+        if self.partition_hash == "ipoly" and entries > MAX_IPOLY_SLICES:
+            raise ValueError(
+                f"partition_hash = 'ipoly' with num_channels = {self.num_channels} and "
+                f"slices_per_channel = {self.slices_per_channel}: allowed are up to "
+                f"{MAX_IPOLY_SLICES} slices"
+            )
         return self
 
 
@@ -233,6 +243,15 @@ class Gpu(_Model):
                 f"dram.sector_bytes = {self.dram.sector_bytes} does not divide the last cache's "
                 f"sector_bytes = {last.sector_bytes}"
             )
+        given = {path: level for path, level, _ in self._levels()}
+        for first in ("l1", "l1_texture"):
+            chain = [path for path in (first, "gl1", "l2", "llc") if path in given]
+            for upper, lower in pairwise(chain):
+                if given[upper].sector_bytes % given[lower].sector_bytes:
+                    raise ValueError(
+                        f"{lower}.sector_bytes = {given[lower].sector_bytes} does not divide "
+                        f"{upper}.sector_bytes = {given[upper].sector_bytes}"
+                    )
         for path, level, instances in self._levels():
             lines = instances * level.num_sets * level.ways
             if lines > MAX_LINES:

@@ -15,24 +15,14 @@ from queue import SimpleQueue
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from numba import njit
 
 from cachesim import cache
-from cachesim.address import (
-    IndexHash,
-    Partition,
-    index_of,
-    partition_of,
-    set_hash,
-    set_indices,
-    slice_and_line,
-)
 from cachesim.coalesce import Placement, Program, coalesce, new_scratch
-from cachesim.config import L2, CacheLevel
 from cachesim.dispatch import IssuedRows
+from cachesim.level import Buffer, Level
 from cachesim.route import pass_down
-from cachesim.stream import GROUP_BITS, STORE, Outcome, Requests
+from cachesim.stream import GROUP_BITS, STORE, Requests
 from traces.errors import InputError
 from traces.texture import unpack_texel
 
@@ -40,43 +30,6 @@ from traces.texture import unpack_texel
 BATCH_ROWS = 8192
 _NUM_BATCHES = 3
 _U64 = np.uint64
-
-
-@njit(cache=True, nogil=True, _nrt=False)
-def _locate_in_slices(  # type: ignore[no-untyped-def]
-    line,
-    count,
-    line_bytes,
-    num_channels,
-    slices_per_channel,
-    run_shift,
-    kind,
-    slices,
-    table,
-    xor,
-    set_kind,
-    num_sets,
-    set_table,
-    out,
-):
-    """Set among all slices' sets, slice by slice, of each line."""
-    line_shift = _U64(0)
-    while (_U64(1) << line_shift) < _U64(line_bytes):
-        line_shift += _U64(1)
-    channels, per_channel = _U64(num_channels), _U64(slices_per_channel)
-    for i in range(_U64(count)):
-        where, number = slice_and_line(
-            line[i] << line_shift,
-            channels,
-            per_channel,
-            _U64(run_shift),
-            kind,
-            slices,
-            table,
-            xor,
-            line_shift,
-        )
-        out[i] = where * _U64(num_sets) + index_of(number, set_kind, num_sets, set_table)
 
 
 @njit(cache=True, nogil=True)
@@ -92,99 +45,11 @@ def _segments_of_positions(position, count, instance_of, out_segments, out_insta
     return runs
 
 
-class Level:
-    """One level of the hierarchy: its caches, and how requests find the one and the set that they belong to."""
-
-    def __init__(
-        self,
-        name: str,
-        config: CacheLevel,
-        num_instances: int,
-        num_groups: int,
-        *,
-        bypass_loads: bool = False,
-        bypass_stores: bool = False,
-    ) -> None:
-        """num_instances: cache instances that a request's SM chooses among; a sliced level counts as one of all its sets."""
-        self.name = name
-        self.config = config
-        self.partition: Partition | None = partition_of(config) if isinstance(config, L2) else None
-        self.hash: IndexHash = set_hash(config)
-        self.rules = cache.cache_rules(
-            config,
-            num_instances,
-            bypass_loads=bypass_loads,
-            bypass_stores=bypass_stores or config.write_policy == "read-only",
-        )
-        if self.partition is not None:
-            self.rules = self.rules._replace(num_sets=self.rules.num_sets * config.num_slices)  # type: ignore[attr-defined]
-        self.state = cache.empty_state(self.rules)
-        self.counters = np.zeros((num_groups, cache.NUM_COUNTERS), np.int64)
-
-    def sets_of(
-        self, line: npt.NDArray[np.uint64], count: int, out: npt.NDArray[np.uint32]
-    ) -> None:
-        """Write the set of each line, within its instance, to out[:count]."""
-        h, p = self.hash, self.partition
-        if p is None:
-            set_indices(line, count, h.kind, h.size, h.table, out)
-        else:
-            _locate_in_slices(
-                line,
-                count,
-                self.config.line_bytes,
-                p.num_channels,
-                p.slices_per_channel,
-                p.run_shift,
-                p.hash.kind,
-                p.hash.size,
-                p.hash.table,
-                p.xor,
-                h.kind,
-                h.size,
-                h.table,
-                out,
-            )
-
-    def access(self, requests: Requests, sets: npt.NDArray[np.uint32], outcome: Outcome) -> None:
-        """Count a batch; fills `outcome`."""
-        cache.access(self.state, self.rules, requests, sets, self.counters, outcome)
-
-    def bound_passed_down(self, num_requests: int, lower: CacheLevel) -> int:
-        """How many requests to the next level a batch can become."""
-        lines = max(1, self.config.line_bytes // lower.line_bytes)
-        kinds = (
-            1
-            + (not self.rules.bypass_stores)
-            + self.rules.can_be_dirty * self.rules.sectors_per_line
-        )
-        return num_requests * lines * kinds
-
-
-class _Buffer:
-    """Room for one batch at one level; pages that are not written cost nothing."""
-
-    def __init__(self, level: Level, num_requests: int, num_segments: int) -> None:
-        self.requests = Requests(
-            line=np.empty(num_requests, np.uint64),
-            mask=np.empty(num_requests, np.uint8),
-            meta=np.empty(num_requests, np.uint32),
-            written=np.empty(num_requests, np.int32),
-            bytes_written=np.empty((num_requests, 8), np.uint32),
-            segments=np.zeros(num_segments + 1, np.int64),
-            instance=np.zeros(num_segments, np.uint32),
-            order=np.zeros(num_segments, np.int64),
-        )
-        self.sets = np.empty(num_requests, np.uint32)
-        self.position = np.empty(num_requests, np.int64)
-        self.outcome = cache.empty_outcome(level.rules, num_requests)
-
-
 @dataclass
 class _Batch:
     """One batch on its way: a buffer per level."""
 
-    buffers: list[_Buffer]
+    buffers: list[Buffer]
     requests: Requests | None = field(default=None)
 
 
@@ -228,11 +93,11 @@ class Hierarchy:
         self._futures: list[Future[Any]] = []
 
     def _new_batch(self, num_requests: int) -> _Batch:
-        buffers = [_Buffer(self.levels[0], num_requests, BATCH_ROWS)]
+        buffers = [Buffer(self.levels[0], num_requests, BATCH_ROWS)]
         for upper, lower in zip(self.levels, self.levels[1:], strict=False):
             num_requests = upper.bound_passed_down(num_requests, lower.config)
             buffers.append(
-                _Buffer(lower, num_requests, num_requests if lower.partition is None else 1)
+                Buffer(lower, num_requests, num_requests if lower.partition is None else 1)
             )
         return _Batch(buffers)
 
@@ -267,16 +132,6 @@ class Hierarchy:
         if top.rules.can_be_dirty and top.state.flags[cache.DIRTY :: 32].any():
             self._write_back_all(0)
         cache.reset(top.state, top.rules)
-
-    def dirty_at_end(self, index: int) -> npt.NDArray[np.int64]:
-        """(num_groups,) int64: dirty sectors that a level holds, by the group that dirtied them."""
-        level = self.levels[index]
-        count = np.zeros(len(self.lane_fetches), np.int64)
-        if level.rules.can_be_dirty:
-            for s in range(level.rules.sectors_per_line):
-                dirty = (level.state.flags[cache.DIRTY :: 32] >> s) & 1 == 1
-                count += np.bincount(level.state.owner[dirty, s], minlength=len(count))
-        return count
 
     def _timed(self, stage: str, work: Callable[..., None], *arguments: Any) -> None:
         start = time.thread_time()
@@ -349,12 +204,12 @@ class Hierarchy:
         finally:
             self._free.put(batch)
 
-    def _access(self, index: int, requests: Requests, buffer: _Buffer) -> None:
+    def _access(self, index: int, requests: Requests, buffer: Buffer) -> None:
         level = self.levels[index]
-        level.sets_of(requests.line, requests.num_requests, buffer.sets)
-        level.access(requests, buffer.sets, buffer.outcome)
+        arranged, sets = level.arrange(requests, buffer)
+        level.access(arranged, sets, buffer.outcome)
 
-    def _descend(self, index: int, requests: Requests, buffers: list[_Buffer]) -> None:
+    def _descend(self, index: int, requests: Requests, buffers: list[Buffer]) -> None:
         """Pass what a level sends down to the next ones."""
         for upper in range(index, len(self.levels) - 1):
             lower = upper + 1
@@ -366,7 +221,7 @@ class Hierarchy:
             requests = passed[0]
             self._timed(self.levels[lower].name, self._access, lower, requests, buffers[lower])
 
-    def _pass_down(self, index: int, requests: Requests, buffers: list[_Buffer]) -> Requests:
+    def _pass_down(self, index: int, requests: Requests, buffers: list[Buffer]) -> Requests:
         upper, lower, buffer = self.levels[index], self.levels[index + 1], buffers[index + 1]
         out = buffer.requests
         num, _ = pass_down(
@@ -415,7 +270,7 @@ class Hierarchy:
             instance=(lines // (rules.num_sets * rules.ways)).astype(np.uint32),
             order=np.arange(len(lines)),
         )
-        buffer = _Buffer(level, len(lines), 1)
+        buffer = Buffer(level, len(lines), 1)
         for s in range(rules.sectors_per_line):
             dirty = (state.flags[cache.DIRTY :: 32][lines] >> s) & 1 == 1
             owner = state.owner[lines[dirty], s]
@@ -431,4 +286,4 @@ class Hierarchy:
         self._descend(index, upper, buffers)
 
 
-__all__ = ["BATCH_ROWS", "Hierarchy", "Level"]
+__all__ = ["BATCH_ROWS", "Hierarchy"]

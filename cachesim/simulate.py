@@ -14,7 +14,8 @@ from cachesim import cache, presets
 from cachesim.coalesce import groups_of, placement_of, program_of
 from cachesim.config import L1, CacheLevel, FetchPath, Gpu
 from cachesim.dispatch import Dispatcher
-from cachesim.hierarchy import BATCH_ROWS, Hierarchy, Level
+from cachesim.hierarchy import BATCH_ROWS, Hierarchy
+from cachesim.level import Level
 from cachesim.report import DramCounters, LevelCounters, Part, Report
 from traces.errors import InputError, unknown
 from traces.placement import place
@@ -166,7 +167,7 @@ class _Model:
     def _report(self) -> Report:
         hierarchy, gpu = self._hierarchy, self._gpu
         levels = hierarchy.levels
-        dirty = [hierarchy.dirty_at_end(k) for k in range(len(levels))]
+        dirty = [level.dirty_by_group(len(hierarchy.lane_fetches)) for level in levels]
         parts = []
         for pair, (pass_name, texture) in enumerate(self._pairs):
             if texture < 0:
@@ -224,7 +225,8 @@ def hierarchy_levels(gpu: Gpu, fetch_path: str, num_groups: int) -> tuple[list[L
         sharing.append(per_array * l1.units_per_sm)
     for name, config in (("l2", gpu.l2), ("llc", gpu.llc)):
         if config is not None:
-            levels.append(Level(name, config, 1, num_groups))
+            is_last = name == "llc" or gpu.llc is None
+            levels.append(Level(name, config, 1, num_groups, by_slice=is_last))
             sharing.append(units)
     for upper, lower in zip(levels, levels[1:], strict=False):
         _check_sectors(gpu, upper.name, upper.config, lower.name, lower.config)

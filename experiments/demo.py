@@ -38,7 +38,7 @@ def command(
     normal_map: NormalMap = None,
     frames: Annotated[
         int, typer.Option("--frames", metavar="N", min=2, help="Frames of the adaptive run.")
-    ] = 16,
+    ] = 8,
     device: DeviceName = None,
     output: Folder = Path("out"),
 ) -> None:

@@ -26,7 +26,7 @@ def command(
     normal_map: NormalMap = None,
     size: ImageSize = "1920x1080",
     output: Folder = Path("out"),
-    frames: Annotated[int, typer.Option("--frames", metavar="N", min=1)] = 16,
+    frames: Annotated[int, typer.Option("--frames", metavar="N", min=1)] = 8,
     device: DeviceName = None,
     method: options.Kind = "adaptive",
     samples: options.Samples = 64,

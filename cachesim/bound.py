@@ -1,0 +1,380 @@
+"""Belady's OPT: how few line misses any replacement policy could reach at one level.
+
+    trace ──► dispatch ──► coalesce ──► levels above ──► line stream ──► next uses ──► OPT
+
+OPT evicts the line whose next use is farthest away [Belady 1966]. Every missed line is inserted: bypassing the cache, which could
+miss less still, is not considered. Counted are loads at line granularity: one access per request to a line, whatever its sectors.
+Stores and atomics at the bounded level are left out of its stream, for OPT and for the policies beside it; the levels above run as
+configured, so that the L2's stream is what the configured L1 passes down, fetches for stores included.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit
+
+from cachesim import cache, presets
+from cachesim.coalesce import groups_of, placement_of, program_of
+from cachesim.config import Gpu
+from cachesim.dispatch import Dispatcher
+from cachesim.hierarchy import BATCH_ROWS, Hierarchy, Level
+from cachesim.simulate import FETCH_PATHS, hierarchy_levels
+from cachesim.stream import GROUP_BITS, LOAD, Outcome, Requests
+from traces.errors import InputError, WorkError, unknown
+from traces.placement import place
+from traces.texture import MAX_MIPS
+from traces.trace import Trace
+
+LEVELS = ("l1", "l2")
+_NEVER = np.int64(1) << np.int64(62)
+_U64, _U32 = np.uint64, np.uint32
+
+
+@dataclass(frozen=True)
+class Bound:
+    """Line misses of one level under OPT, LRU and its own policy, over the same loads.
+
+    level: "l1" or "l2". accesses: load requests looked up there. misses: OPT's, the bound. lru_misses: LRU's. policy: the level's
+    own `replacement`; policy_misses: its misses.
+    """
+
+    level: str
+    accesses: int
+    misses: int
+    lru_misses: int
+    policy: str
+    policy_misses: int
+
+    @property
+    def miss_rate(self) -> float | None:
+        """OPT's misses / accesses; None where nothing was asked."""
+        return self.misses / self.accesses if self.accesses else None
+
+    @property
+    def lru_miss_rate(self) -> float | None:
+        """LRU's misses / accesses; None where nothing was asked."""
+        return self.lru_misses / self.accesses if self.accesses else None
+
+    @property
+    def policy_miss_rate(self) -> float | None:
+        """The level's own policy's misses / accesses; None where nothing was asked."""
+        return self.policy_misses / self.accesses if self.accesses else None
+
+
+def belady(
+    trace: Trace,
+    gpu: Gpu | str,
+    level: str = "l1",
+    *,
+    fetch_path: str | None = None,
+    layout: str | None = None,
+    progress: Callable[[int], None] | None = None,
+) -> Bound:
+    """Bound the line misses of a trace's loads at one level of a GPU.
+
+    The trace is read once. Its line stream (the L1's of one launch at a time, as L1s start empty at each; the L2's whole) lies in
+    temporary files, 20 bytes per request; in memory are 17 bytes per request of the busiest set, twice that for its distinct
+    lines, and the caches.
+
+    Args:
+        level: "l1" or "l2". fetch_path, layout: as in `simulate`. progress: called with the number of lane fetches read so far.
+
+    Raises:
+        InputError: an unknown GPU, level, fetch path or layout, or a trace that does not fit.
+        WorkError: no room for the temporary files.
+    """
+    gpu = presets.load(gpu) if isinstance(gpu, str) else gpu
+    path = fetch_path or (gpu.lane_address_path if trace.is_lane_address else "texture")
+    if path not in FETCH_PATHS:
+        raise unknown("fetch path", path, FETCH_PATHS)
+    if level not in LEVELS:
+        raise unknown("level", level, LEVELS)
+    texel_layout = None if trace.is_lane_address else layout or gpu.texture_layout
+    address_map = place(trace.textures, texel_layout) if texel_layout else None
+    num_groups = max(1, len(groups_of(trace))) * MAX_MIPS
+    levels, units = hierarchy_levels(gpu, path, num_groups)
+    index = [above.name for above in levels].index(level)
+    try:
+        with _Stream() as stream:
+            recorded = _RecordedLevel(levels[index], stream)
+            hierarchy = Hierarchy(
+                [*levels[:index], recorded],
+                [1, *units[1 : index + 1]],
+                program_of(trace),
+                placement_of(address_map),
+                warp_size=gpu.sm.warp_size,
+                texel_range=(address_map.base_address, address_map.footprint_bytes)
+                if address_map
+                else None,
+                num_groups=num_groups,
+                threaded=True,
+            )
+            try:
+                _run(trace, gpu, units[0], hierarchy, recorded, progress)
+            finally:
+                hierarchy.close()
+            recorded.end_stream()
+    except InputError:
+        raise
+    except OSError as error:
+        raise WorkError(f"temporary files of the line stream: {error.strerror}") from error
+    return recorded.bound()
+
+
+def _run(
+    trace: Trace,
+    gpu: Gpu,
+    units_per_sm: int,
+    hierarchy: Hierarchy,
+    recorded: _RecordedLevel,
+    progress: Callable[[int], None] | None,
+) -> None:
+    """Send the trace through the levels, as `simulate` does."""
+    dtype = np.uint64 if trace.is_lane_address else np.uint32
+    dispatcher = Dispatcher(gpu.sm, units_per_sm, dtype, BATCH_ROWS)
+    launch = -1
+
+    def issue() -> None:
+        while (rows := dispatcher.issue()) is not None:
+            hierarchy.process(rows)
+
+    def end_launch() -> None:
+        dispatcher.finish()
+        issue()
+        hierarchy.end_launch()
+        if hierarchy.levels[0] is recorded:
+            recorded.end_stream()
+
+    for chunk in trace.chunks():
+        if chunk.launch != launch:
+            if launch >= 0:
+                end_launch()
+            launch = chunk.launch
+            dispatcher.begin(trace.launches[launch])
+        dispatcher.add(chunk)
+        issue()
+        if progress is not None:
+            progress(int(hierarchy.lane_fetches.sum()))
+    if launch >= 0:
+        end_launch()
+
+
+class _RecordedLevel(Level):
+    """The bounded level: it writes down its stream of loads, and counts LRU's and its own policy's misses of whole lines."""
+
+    def __init__(self, level: Level, stream: _Stream) -> None:
+        whole_lines = {"sector_bytes": level.config.line_bytes}
+        self._policies = {
+            name: Level(
+                level.name,
+                level.config.model_copy(update={**whole_lines, "replacement": name}),
+                level.rules.num_instances,
+                1,
+            )
+            for name in dict.fromkeys(("lru", level.config.replacement))
+        }
+        self.__dict__.update(vars(level))
+        self._stream = stream
+        self._accesses = self._misses = 0
+
+    def access(self, requests: Requests, sets: npt.NDArray[np.uint32], outcome: Outcome) -> None:
+        if self.rules.bypass_loads:
+            return
+        loads = requests.meta[: requests.num_requests] >> _U32(GROUP_BITS) == LOAD
+        before = np.concatenate([[0], np.cumsum(loads)])
+        lengths = np.diff(requests.segments)
+        kept_sets = sets[: len(loads)][loads]
+        kept = requests._replace(
+            line=requests.line[: len(loads)][loads],
+            mask=np.ones(before[-1], np.uint8),
+            meta=np.full(before[-1], LOAD << GROUP_BITS, np.uint32),
+            segments=before[requests.segments],
+        )
+        for level in self._policies.values():
+            level.access(kept, kept_sets, cache.empty_outcome(level.rules, len(kept_sets)))
+        instance = np.repeat(requests.instance, lengths)[loads]
+        self._stream.append(kept.line, instance * _U32(self.rules.num_sets) + kept_sets)
+
+    def end_stream(self) -> None:
+        """Bound what was written down since the last call; the level starts empty again."""
+        num_sets = self.rules.num_instances * self.rules.num_sets
+        self._accesses += self._stream.num_requests
+        self._misses += self._stream.optimal_misses(num_sets, self.rules.ways)
+        for level in self._policies.values():
+            cache.reset(level.state, level.rules)
+
+    def bound(self) -> Bound:
+        """The sums over all streams."""
+        misses = {
+            name: int(level.counters[:, cache.LINE_MISSES].sum())
+            for name, level in self._policies.items()
+        }
+        own = self.config.replacement
+        return Bound(self.name, self._accesses, self._misses, misses["lru"], own, misses[own])
+
+
+class _Stream:
+    """A sequence of (line, set) pairs in two temporary files."""
+
+    def __init__(self) -> None:
+        self._lines = tempfile.TemporaryFile()
+        self._sets = tempfile.TemporaryFile()
+        self.num_requests = 0
+
+    def __enter__(self) -> _Stream:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._lines.close()
+        self._sets.close()
+
+    def append(self, line: npt.NDArray[np.uint64], cache_set: npt.NDArray[np.uint32]) -> None:
+        """Write more pairs. line: (n,) uint64 line numbers; cache_set: (n,) uint32, set among those of all instances."""
+        self._lines.write(line.tobytes())
+        self._sets.write(cache_set.astype(np.uint32, copy=False).tobytes())
+        self.num_requests += len(line)
+
+    def optimal_misses(self, num_sets: int, ways: int) -> int:
+        """OPT's misses over the sequence, from empty sets; forgets the sequence."""
+        if self.num_requests == 0:
+            return 0
+        self._lines.flush()
+        self._sets.flush()
+        line, cache_set = self._map(self._lines, np.uint64), self._map(self._sets, np.uint32)
+        starts = np.zeros(num_sets + 1, np.int64)
+        with tempfile.TemporaryFile() as file:
+            file.truncate(8 * self.num_requests)
+            by_set = self._map(file, np.uint64)
+            _group_by_set(line, cache_set, starts, by_set)
+            misses = int(_optimal_misses(by_set, starts, ways))
+        for written in (self._lines, self._sets):
+            written.seek(0)
+            written.truncate()
+        self.num_requests = 0
+        return misses
+
+    def _map(self, file: Any, dtype: type) -> npt.NDArray[Any]:
+        return np.asarray(np.memmap(file, dtype, "r+", shape=(self.num_requests,)))
+
+
+@njit(cache=True, nogil=True)
+def _group_by_set(line, cache_set, starts, out):  # type: ignore[no-untyped-def]
+    """Write the lines of each set to out, in order, set after set; starts: (num_sets + 1,) zeros, becomes where each set begins."""
+    for i in range(len(line)):
+        starts[cache_set[i] + 1] += 1
+    for s in range(1, len(starts)):
+        starts[s] += starts[s - 1]
+    at = starts[:-1].copy()
+    for i in range(len(line)):
+        out[at[cache_set[i]]] = line[i]
+        at[cache_set[i]] += 1
+
+
+@njit(cache=True, nogil=True)
+def _next_uses(line, begin, end, stamp, key, position, owner, next_use):  # type: ignore[no-untyped-def]
+    """Where each line of one set's stream is used next, counted from begin, or `_NEVER`.
+
+    key, position, owner: a hash table of a power of two of entries; an entry is of this set where owner is `stamp`.
+    """
+    last = _U64(len(key) - 1)
+    for t in range(end - begin - 1, -1, -1):
+        number = line[begin + t]
+        bucket = ((number * _U64(0x9E3779B97F4A7C15)) >> _U64(20)) & last
+        while owner[bucket] == stamp and key[bucket] != number:
+            bucket = (bucket + _U64(1)) & last
+        next_use[t] = position[bucket] if owner[bucket] == stamp else _NEVER
+        owner[bucket], key[bucket], position[bucket] = stamp, number, t
+
+
+@njit(cache=True, nogil=True)
+def _sift_down(heap, size, at):  # type: ignore[no-untyped-def]
+    """Move an entry of a max-heap down to its place."""
+    value = heap[at]
+    while 2 * at + 1 < size:
+        child = 2 * at + 1
+        if child + 1 < size and heap[child + 1] > heap[child]:
+            child += 1
+        if heap[child] <= value:
+            break
+        heap[at] = heap[child]
+        at = child
+    heap[at] = value
+
+
+@njit(cache=True, nogil=True)
+def _push(heap, size, value):  # type: ignore[no-untyped-def]
+    """Add an entry to a max-heap of `size` entries."""
+    at = size
+    while at > 0 and heap[(at - 1) // 2] < value:
+        heap[at] = heap[(at - 1) // 2]
+        at = (at - 1) // 2
+    heap[at] = value
+
+
+@njit(cache=True, nogil=True)
+def _misses_of_set(next_use, num, ways, expected, heap):  # type: ignore[no-untyped-def]
+    """OPT's misses of one set.
+
+    expected: (num,) uint8, 1 where the line used then is resident and waits for that use. heap: (2 ways + 2,) int64, the uses that
+    residents wait for, farthest first; entries in the past are left behind by hits and never reach the top, as any resident with
+    a use ahead stands above them.
+    """
+    expected[:num] = 0
+    misses, resident, dead, size = 0, 0, 0, 0
+    for t in range(num):
+        if not expected[t]:
+            misses += 1
+            if resident < ways:
+                resident += 1
+            elif dead:
+                # A resident that is never used again is farther than any other.
+                dead -= 1
+            else:
+                expected[heap[0]] = 0
+                size -= 1
+                heap[0] = heap[size]
+                _sift_down(heap, size, 0)
+        if next_use[t] == _NEVER:
+            dead += 1
+            continue
+        expected[next_use[t]] = 1
+        if size == len(heap):
+            kept = 0
+            for k in range(size):
+                if heap[k] > t:
+                    heap[kept] = heap[k]
+                    kept += 1
+            size = kept
+            for at in range(size // 2 - 1, -1, -1):
+                _sift_down(heap, size, at)
+        _push(heap, size, next_use[t])
+        size += 1
+    return misses
+
+
+@njit(cache=True, nogil=True)
+def _optimal_misses(line, starts, ways):  # type: ignore[no-untyped-def]
+    """OPT's misses of all sets. line: streams of all sets, set after set; starts: (num_sets + 1,) int64."""
+    longest = 0
+    for s in range(len(starts) - 1):
+        longest = max(longest, starts[s + 1] - starts[s])
+    entries = 16
+    while entries < 2 * longest:
+        entries *= 2
+    key, position = np.zeros(entries, np.uint64), np.zeros(entries, np.int64)
+    owner = np.full(entries, -1, np.int64)
+    next_use, expected = np.empty(longest, np.int64), np.empty(longest, np.uint8)
+    heap = np.empty(2 * ways + 2, np.int64)
+    misses = 0
+    for s in range(len(starts) - 1):
+        begin, end = starts[s], starts[s + 1]
+        if end > begin:
+            _next_uses(line, begin, end, s, key, position, owner, next_use)
+            misses += _misses_of_set(next_use, end - begin, ways, expected, heap)
+    return misses
