@@ -31,6 +31,8 @@ _POLYNOMIALS = {
 #: How many low bits of the block number IPOLY looks at (facts sheet 3.2: "up to" bit 16, 19, 24); 40 for the degrees GPGPU-Sim has no table for.
 _IPOLY_BITS = {4: 17, 5: 20, 6: 25}
 
+_EXACT = np.uint64(1 << 52)
+
 # Kinds of index function.
 MASK, MODULO, TABLE, RANDOM = range(4)
 
@@ -187,7 +189,11 @@ def slice_and_line(  # type: ignore[no-untyped-def]
     else:
         block = run // per_channel
         within_channel = run - block * per_channel
-    row = block // channels
+    if block < _EXACT:
+        # Exact below 2^52, and cheaper than a 64-bit integer division.
+        row = U64(np.float64(np.int64(block)) / np.float64(np.int64(channels)))
+    else:
+        row = block // channels
     if kind == MASK or kind == MODULO:
         channel = block - row * channels
         if xor:

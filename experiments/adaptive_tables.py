@@ -94,7 +94,8 @@ def findings(ratios: pd.DataFrame, size: str) -> list[str]:
     whole, sampling = (ratios[ratios["passes"] == p] for p in PASSES)
     lines = [
         "ratio is adaptive / fixed over all passes, of sampling the same over the sampling pass. "
-        "MB = 10^6 B; miss rates are local: misses / accesses of that level.",
+        "MB = 10^6 B; miss rates are local: misses / accesses of that level. A sector is 32 B on "
+        "NVIDIA and 128 B in RDNA's L0 and L2, so a scattered texel asks for more there.",
         f"The L2 and DRAM columns depend on the resolution: at {size} the frame has another size "
         "relative to the L2 than at the paper's 1080p.",
     ]

@@ -138,6 +138,8 @@ def mip_figure(frame: pd.DataFrame, label: str) -> Figure:
         }
         _paired_bars(axes, [str(mip) for mip in mips], heights)
         axes.set_title(scene, fontsize=FONT_SIZE)
+        # Each level holds a quarter of the one below: a linear axis would show mip 0 alone.
+        axes.set_yscale("log")
         axes.set_xlabel("mip level", fontsize=FONT_SIZE)
         axes.set_ylabel(label, fontsize=FONT_SIZE)
         axes.legend(fontsize=FONT_SIZE - 1, frameon=False)

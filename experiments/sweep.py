@@ -32,7 +32,7 @@ def command(
 
     from experiments.console import progress, remark
     from experiments.options import check_fetch_path
-    from experiments.output import output_file, write_text, write_figure
+    from experiments.output import output_file, write_figure, write_text
     from experiments.plots import sweep_figure
 
     output_file(output, ".csv")

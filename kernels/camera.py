@@ -13,7 +13,8 @@ Vector = tuple[float, float, float]
 
 MAX_SIZE = 16384
 
-# 1 / tan(15 degrees) = 2 + sqrt(3): a horizontal field of view of 30 degrees, the angle of a portrait lens.
+# 1 / tan(15 degrees) = 2 + sqrt(3): a horizontal field of view of 30 degrees, the angle of a
+# portrait lens.
 PORTRAIT = 3.7320508
 
 
@@ -23,7 +24,8 @@ class Camera:
 
     name: as tables print it.
     position, target: cm, world space. up: the direction that points up in the picture.
-    projection_x: M = 1 / tan(fov_x / 2); the width of the frame fixes the field of view, the height follows the aspect.
+    projection_x: M = 1 / tan(fov_x / 2); the width of the frame fixes the field of view, the height
+    follows the aspect.
     coverage_rate: share of the frame that is skin at 1920x1080, None if not stated.
     pixels_per_mm: median physical scale over the skin at 1920x1080, None if not stated.
     """
@@ -59,8 +61,9 @@ class Camera:
         return right, np.cross(right, forward), forward
 
 
-# The views of the procedural head, named as in the dissertation. The published times suggest a coverage of about
-# 100, 90 and 13 % for close, ear and front; test_scenes.py holds each to its stated numbers.
+# The views of the procedural head, named as in the dissertation. The published times suggest a
+# coverage of about 100, 90 and 13 % for close, ear and front; test_scenes.py holds each to its
+# stated numbers.
 CAMERAS: dict[str, Camera] = {
     camera.name: camera
     for camera in (

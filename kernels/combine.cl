@@ -1,7 +1,7 @@
 // Combine: scattered light times albedo, plus everything that does not scatter.
 PASS_KERNEL combine(
-    WARP_ARGS, __global const half *scene_colour, __global const uchar *profile_id, __global const half *scattered,
-    __global const half *albedo, __global half *output TRACE_ARGS)
+    WARP_ARGS, __global const half *scene_colour, __global const uchar *profile_id,
+    __global const half *scattered, __global const half *albedo, __global half *output TRACE_ARGS)
 {
     FIND_PIXEL
     FIND_ROW

@@ -1,9 +1,9 @@
 // Estimate: this frame's sample count of each pixel from its history, before the sampling pass of
 // the adaptive method. Counts are stored in lane order, so that a warp's largest is one run.
 PASS_KERNEL estimate(
-    WARP_ARGS, __global const ushort *setup_texture, __global const float2 *velocity, __global const half *history,
-    __global ushort *counts, const int has_velocity, const float sigma0_sq, const float kappa, const float k_minus_1,
-    const float b_min, const float b_max)
+    WARP_ARGS, __global const ushort *setup_texture, __global const float2 *velocity,
+    __global const half *history, __global ushort *counts, const int has_velocity, const float sigma0_sq,
+    const float kappa, const float k_minus_1, const float b_min, const float b_max)
 {
     FIND_PIXEL
     const float depth = inside ? load_setup(setup_texture, setup_index(0, y, x, width, height)).w : 0.0f;

@@ -1,4 +1,7 @@
-"""The procedural head: a signed-distance field of a man's head, sphere-traced in OpenCL. Needs no data file."""
+"""The procedural head: a signed-distance field of a man's head, sphere-traced in OpenCL.
+
+Needs no data file.
+"""
 
 from __future__ import annotations
 
@@ -114,7 +117,9 @@ def render_head(
 
 @cache
 def _kernels(device: Device) -> tuple[cl.Kernel, cl.Kernel, cl.Buffer]:
-    """The kernels and the distance grid, which depends on nothing but the shape: once per device."""
+    """The kernels and the distance grid, which depends on nothing but the shape: once per
+    device.
+    """
     import pyopencl as cl
 
     exact = device.correctly_rounded or "cl_khr_fp64" not in device.context.devices[0].extensions
@@ -125,7 +130,9 @@ def _kernels(device: Device) -> tuple[cl.Kernel, cl.Kernel, cl.Buffer]:
 
 
 def _view(camera: Camera, width: int) -> list[np.ndarray]:
-    """Origin, right, up, forward as float4; .w of right and up is the size of a pixel at unit depth."""
+    """Origin, right, up, forward as float4; .w of right and up is the size of a pixel at unit
+    depth.
+    """
     right, up, forward = camera.basis()
     pixel = 2.0 / (width * camera.projection_x)
     return [

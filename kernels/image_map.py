@@ -16,7 +16,9 @@ Float = npt.NDArray[np.float32]
 
 @dataclass(frozen=True, eq=False)
 class ImageMap:
-    """levels: (h, w, 3) float32 each, the first is the image, every next half the size, down to one texel."""
+    """levels: (h, w, 3) float32 each, the first is the image, every next half the size, down to one
+    texel.
+    """
 
     levels: tuple[Float, ...]
 
@@ -51,7 +53,10 @@ def load_albedo(source: str | Path | Image.Image) -> ImageMap:
 
 
 def load_normals(source: str | Path | Image.Image) -> ImageMap:
-    """A tangent-space normal map, +y up, as vectors in [-1, 1]. Raises InputError if it cannot be read."""
+    """A tangent-space normal map, +y up, as vectors in [-1, 1].
+
+    Raises InputError if it cannot be read.
+    """
     return _with_mips(_pixels(source, "normal map") * np.float32(2) - np.float32(1))
 
 
@@ -75,7 +80,9 @@ def _with_mips(image: Float) -> ImageMap:
     while max(levels[-1].shape[:2]) > 1:
         level = levels[-1]
         # Repeat the last row or column of odd sizes, then average 2 x 2
-        level = np.pad(level, [(0, s % 2 if s > 1 else 1) for s in level.shape[:2]] + [(0, 0)], "edge")
+        level = np.pad(
+            level, [(0, s % 2 if s > 1 else 1) for s in level.shape[:2]] + [(0, 0)], "edge"
+        )
         height, width = level.shape[0] // 2, level.shape[1] // 2
         levels.append(level.reshape(height, 2, width, 2, 3).mean(axis=(1, 3), dtype=np.float32))
     return ImageMap(tuple(levels))

@@ -1,4 +1,7 @@
-"""Lights as data. Distances do not matter: every light stands far off and is a disc as seen from the scene."""
+"""Lights as data.
+
+Distances do not matter: every light stands far off and is a disc as seen from the scene.
+"""
 
 from __future__ import annotations
 
@@ -17,9 +20,11 @@ class Light:
     """A distant disc of light.
 
     name: key, fill, rim ...
-    towards: direction from the scene to the light, world space (y up, the face looks along +z); any length.
+    towards: direction from the scene to the light, world space (y up, the face looks along +z); any
+    length.
     irradiance: linear RGB that a surface facing the light receives.
-    radius: tangent of the disc's angular radius; half the width of a penumbra per distance to the edge that casts it.
+    radius: tangent of the disc's angular radius; half the width of a penumbra per distance to the
+    edge that casts it.
     shadows: whether it casts any.
     """
 
@@ -69,8 +74,9 @@ class Rig:
         return np.array(rows, dtype=np.float32).reshape(-1, 8)
 
 
-# A portrait in one key: fully lit skin receives about 1, skin in the key's shadow 0.05 to 0.1. The key stands high to
-# the head's left, so that the shadow of nose, brow and cheek has its soft edge in every view.
+# A portrait in one key: fully lit skin receives about 1, skin in the key's shadow 0.05 to 0.1. The
+# key stands high to the head's left, so that the shadow of nose, brow and cheek has its soft edge
+# in every view.
 RIG = Rig(
     lights=(
         Light("key", (0.58, 0.58, 0.68), (0.98, 0.93, 0.86), 0.10),

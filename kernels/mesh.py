@@ -1,4 +1,6 @@
-"""Meshes by path (glTF, OBJ, PLY): read, put upright, scaled to centimetres, with normals, tangents and maps."""
+"""Meshes by path (glTF, OBJ, PLY): read, put upright, scaled to centimetres, with normals, tangents
+and maps.
+"""
 
 from __future__ import annotations
 
@@ -28,8 +30,11 @@ SKIN = (0.64, 0.395, 0.285)
 HEAD_CM = 23.0
 HEAD_PER_BREADTH = 1.5
 ABOVE_EARS = 0.4
-# A smooth normal farther than this from its face's own belongs to an edge: the face's is used (cosine of 45 degrees).
+# A smooth normal farther than this from its face's own belongs to an edge: the face's is used
+# (cosine of 45 degrees).
 EDGE_COSINE = 0.7071
+# With fewer seam vertices than this, the map's orientation is not judged.
+MIN_SEAM = 16
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,10 +45,12 @@ class Mesh:
     corners: (faces, 3, 3) float32 positions.
     normals: (faces, 3, 3) float32, unit, one per corner.
     uv: (faces, 3, 2) float32, v up; zeros if the file has none.
-    tangents: (faces, 3, 3) float32, direction of growing u per corner, not normalised; zeros without uv.
+    tangents: (faces, 3, 3) float32, direction of growing u per corner, not normalised; zeros
+    without uv.
     handedness: (faces,) float32, -1 where the map is mirrored, else 1.
     texels_per_cm: (faces,) float32, for a map one texel wide: sqrt(area in uv / area in cm^2).
-    head_centre: (3,) float64, centre of the head's bounding box in cm; head_height: from crown to chin, cm.
+    head_centre: (3,) float64, centre of the head's bounding box in cm; head_height: from crown to
+    chin, cm.
     albedo: linear RGB where there is no albedo map.
     """
 
@@ -67,7 +74,7 @@ def load_mesh(
     *,
     albedo_map: str | Path | None = None,
     normal_map: str | Path | None = None,
-    flip_v: bool = False,
+    flip_v: bool | None = None,
     height_cm: float | None = None,
     up: str = "+y",
     forward: str = "+z",
@@ -76,11 +83,13 @@ def load_mesh(
 
     albedo_map: sRGB image; None takes the file's own base colour map or colour.
     normal_map: tangent-space image, +y up; None takes the file's own.
-    flip_v: for files whose v runs against their format's rule (glTF: down), as that of the Lee Perry-Smith scan does.
-    height_cm: the bounding box is scaled to this height, as files rarely say their unit truly; None scales the head, as
-    `_head_box` finds it, to 23 cm from crown to chin.
+    flip_v: whether v runs against the format's rule (glTF's points down); None judges by the albedo
+    map, which must agree with itself across the seams of the uv map.
+    height_cm: the bounding box is scaled to this height, as files rarely say their unit truly; None
+    scales the head, as `_head_box` finds it, to 23 cm from crown to chin.
     up, forward: the file's axes that become +y and +z, as "+y", "-x" and so on.
-    Raises InputError: no such file, an unknown suffix, nothing to draw, a map without uv coordinates.
+    Raises InputError: no such file, an unknown suffix, nothing to draw, a map without uv
+    coordinates.
     """
     path = Path(path)
     if path.suffix.lower() not in SUFFIXES:
@@ -115,15 +124,20 @@ def load_mesh(
 
     uv, material = _texture(raw)
     if uv is None and (albedo_map is not None or normal_map is not None):
-        raise InputError(f"{path}: the mesh has no uv coordinates, which albedo_map and normal_map need")
+        raise InputError(
+            f"{path}: the mesh has no uv coordinates, which albedo_map and normal_map need"
+        )
     corner_uv = uv[faces] if uv is not None else np.zeros((len(faces), 3, 2))
-    if flip_v:
-        corner_uv = corner_uv * [1, -1] + [0, 1]
-    tangents, handedness, uv_areas = _tangents(corners, corner_uv, faces, len(positions))
     own_albedo = material.get("albedo_map") if uv is not None else None
     own_normals = material.get("normal_map") if uv is not None else None
     albedo_source = albedo_map if albedo_map is not None else own_albedo
     normal_source = normal_map if normal_map is not None else own_normals
+    albedo_image = None if albedo_source is None else load_albedo(albedo_source)
+    if flip_v is None:
+        flip_v = albedo_image is not None and _seams_fit_flipped(corners, corner_uv, albedo_image)
+    if flip_v:
+        corner_uv = corner_uv * [1, -1] + [0, 1]
+    tangents, handedness, uv_areas = _tangents(corners, corner_uv, faces, len(positions))
     return Mesh(
         name=path.stem,
         attribution=_attribution(path),
@@ -136,7 +150,7 @@ def load_mesh(
         head_centre=(head_centre - (low + high) / 2) * scale,
         head_height=head_height * scale,
         albedo=material.get("albedo", SKIN),
-        albedo_map=None if albedo_source is None else load_albedo(albedo_source),
+        albedo_map=albedo_image,
         normal_map=None if normal_source is None else load_normals(normal_source),
     )
 
@@ -171,9 +185,11 @@ def _rotation(up: str, forward: str, path: Path) -> npt.NDArray[np.float64]:
 
 
 def _head_box(points: npt.NDArray[np.float64]) -> tuple[npt.NDArray[np.float64], float]:
-    """Centre and height of the head: the upper part of a bust, the whole of a mesh without shoulders.
+    """Centre and height of the head: the upper part of a bust, the whole of a mesh without
+    shoulders.
 
-    From the crown down to 1.5 times the breadth that is found in the upper two fifths of just that part, above the ears.
+    From the crown down to 1.5 times the breadth that is found in the upper two fifths of just that
+    part, above the ears.
     """
     top, total = points[:, 1].max(), np.ptp(points[:, 1])
     height = total
@@ -194,7 +210,9 @@ def _smooth_normals(
     corners: npt.NDArray[np.float64],
     face_normals: npt.NDArray[np.float64],
 ) -> npt.NDArray[np.float64]:
-    """(faces, 3, 3): the mean of the adjoining faces' normals, weighted by their angle; kept sharp at edges."""
+    """(faces, 3, 3): the mean of the adjoining faces' normals, weighted by their angle; kept sharp
+    at edges.
+    """
     # Vertices that only uv coordinates keep apart are one
     _, merged = np.unique(positions, axis=0, return_inverse=True)
     index = merged.reshape(-1)[faces]
@@ -215,7 +233,9 @@ def _tangents(
     faces: npt.NDArray[np.int64],
     num_vertices: int,
 ) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64], npt.NDArray[np.float64]]:
-    """Direction of u per corner, smoothed over each vertex; handedness and twice the uv area per face."""
+    """Direction of u per corner, smoothed over each vertex; handedness and twice the uv area per
+    face.
+    """
     edge1, edge2 = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     uv1, uv2 = uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
     area = uv1[:, 0] * uv2[:, 1] - uv2[:, 0] * uv1[:, 1]
@@ -225,6 +245,27 @@ def _tangents(
     for corner in range(3):
         np.add.at(total, faces[:, corner], along_u)
     return total[faces], np.where(area < 0, -1.0, 1.0), np.abs(area)
+
+
+def _seams_fit_flipped(
+    corners: npt.NDArray[np.float64], uv: npt.NDArray[np.float64], image: ImageMap
+) -> bool:
+    """Whether the image's colours on the two sides of the uv map's seams agree clearly better
+    upside down.
+    """
+    points = np.concatenate([corners, uv], axis=2).reshape(-1, 5)
+    points = np.unique(points[np.isfinite(points).all(axis=1)], axis=0)
+    # Sorted by position: neighbours at one place with two uvs are the two sides of a seam
+    seam = np.flatnonzero((points[1:, :3] == points[:-1, :3]).all(axis=1))
+    if len(seam) < MIN_SEAM:
+        return False
+
+    def mismatch(flip: bool) -> float:
+        where = points[:, 3:] * [1, -1] + [0, 1] if flip else points[:, 3:]
+        colours = image.sample(where.astype(np.float32), np.full(len(where), 4, np.float32))
+        return float(np.abs(colours[seam + 1] - colours[seam]).mean())
+
+    return mismatch(True) < 0.7 * mismatch(False)
 
 
 def _texture(mesh: trimesh.Trimesh) -> tuple[npt.NDArray[np.float64] | None, dict[str, Any]]:
@@ -237,7 +278,9 @@ def _texture(mesh: trimesh.Trimesh) -> tuple[npt.NDArray[np.float64] | None, dic
     if uv is not None and not np.isfinite(uv).all():
         uv = None
     material = mesh.visual.material
-    found["albedo_map"] = getattr(material, "baseColorTexture", None) or getattr(material, "image", None)
+    found["albedo_map"] = getattr(material, "baseColorTexture", None) or getattr(
+        material, "image", None
+    )
     found["normal_map"] = getattr(material, "normalTexture", None)
     factor = getattr(material, "baseColorFactor", None)
     if factor is not None:
@@ -249,7 +292,9 @@ def _texture(mesh: trimesh.Trimesh) -> tuple[npt.NDArray[np.float64] | None, dic
 
 
 def _attribution(path: Path) -> str:
-    """The sentence that grants the licence in `<stem>_License.txt`, else its first line; "" without such a file."""
+    """The sentence that grants the licence in `<stem>_License.txt`, else its first line; "" without
+    such a file.
+    """
     licence = path.with_name(f"{path.stem}_License.txt")
     if not licence.is_file():
         return ""

@@ -1,6 +1,7 @@
 """Rendering a mesh into a G-buffer: ray casting with Embree, band by band of rows.
 
-Not bit-identical over processors: Embree chooses its instructions at run time. Save the G-buffer to hand on the same bits.
+Not bit-identical over processors: Embree chooses its instructions at run time. Save the G-buffer to
+hand on the same bits.
 """
 
 from __future__ import annotations
@@ -34,7 +35,8 @@ REFLECTANCE = np.float32(0.028)
 
 
 def mesh_camera(name: str, mesh: Mesh) -> Camera:
-    """One of the procedural head's views, moved and scaled with the bounding box of the mesh's head.
+    """One of the procedural head's views, moved and scaled with the bounding box of the mesh's
+    head.
 
     Raises InputError for another name.
     """
@@ -59,11 +61,12 @@ def render_mesh(
 ) -> GBuffer:
     """Render a mesh; every pixel of it is skin (profile 1).
 
-    path: a file for load_mesh, or its result. width, height: pixels. camera: close, ear, front, side (placed from the
-    bounding box) or a Camera in cm. rig: the lights. progress: called with the share done after each band.
+    path: a file for load_mesh, or its result. width, height: pixels. camera: close, ear, front,
+    side (placed from the bounding box) or a Camera in cm. rig: the lights. progress: called with
+    the share done after each band.
     options: for load_mesh.
-    Returns a GBuffer of (height, width). Raises InputError for what load_mesh refuses, for sizes that are not 1 to
-    16384 pixels, and where the camera does not see the mesh.
+    Returns a GBuffer of (height, width). Raises InputError for what load_mesh refuses, for sizes
+    that are not 1 to 16384 pixels, and where the camera does not see the mesh.
     """
     check_size(width, height)
     mesh = path if isinstance(path, Mesh) else load_mesh(path, **options)
@@ -83,7 +86,9 @@ def render_mesh(
         hit = caster.first_hit(origins, directions)
         found = hit["primID"] >= 0
         if found.any():
-            shaded = _shade(mesh, caster, occlusion, rig, camera, width, directions[found], hit, found)
+            shaded = _shade(
+                mesh, caster, occlusion, rig, camera, width, directions[found], hit, found
+            )
             flat = found.reshape(-1, width)
             for name, plane in planes.items():
                 plane[rows][flat] = shaded[name]
@@ -124,7 +129,9 @@ class _Caster:
 
 
 def _primary_rays(camera: Camera, width: int, height: int, rows: slice) -> Rays:
-    """Directions reach unit depth along the view axis, so that the ray parameter is the linear depth."""
+    """Directions reach unit depth along the view axis, so that the ray parameter is the linear
+    depth.
+    """
     right, up, forward = camera.basis()
     pixel = 2.0 / (width * camera.projection_x)
     x = (np.arange(width) + 0.5 - width / 2) * pixel
@@ -198,7 +205,9 @@ def _mapped_normal(
     tangent = (mesh.tangents[face] * weights).sum(axis=1)
     tangent = _unit(tangent - smooth * _dot(smooth, tangent)[:, None])
     bitangent = np.cross(smooth, tangent) * mesh.handedness[face][:, None]
-    x, y, z = np.moveaxis(mesh.normal_map.sample(uv, texels * mesh.normal_map.width), 1, 0)[:, :, None]
+    x, y, z = np.moveaxis(mesh.normal_map.sample(uv, texels * mesh.normal_map.width), 1, 0)[
+        :, :, None
+    ]
     return _unit(tangent * x + bitangent * y + smooth * np.maximum(z, 0.1))
 
 
@@ -217,11 +226,14 @@ def _glint(normal: Float, towards: Float, view: Float, radius: float) -> Float:
 def _visible_share(caster: _Caster, origins: Float, light: Light) -> Float:
     """Share of the light's disc seen from each of (n, 3) points.
 
-    A ring of four rays first; only where they disagree, or one stands alone against the centre, the whole pattern.
+    A ring of four rays first; only where they disagree, or one stands alone against the centre, the
+    whole pattern.
     """
     pattern = _disc_pattern(light, SHADOW_RAYS)
     rim = _disc_points(light, np.array([[1, 0], [0, 1], [-1, 0], [0, -1], [0, 0]]) * 0.98)
-    hidden = np.stack([caster.blocked(origins, _repeat(ray, len(origins))) for ray in rim]).sum(axis=0)
+    hidden = np.stack([caster.blocked(origins, _repeat(ray, len(origins))) for ray in rim]).sum(
+        axis=0
+    )
     share = (hidden == 0).astype(np.float32)
     mixed = np.flatnonzero((hidden > 0) & (hidden < len(rim)))
     if len(mixed):
@@ -234,7 +246,9 @@ def _visible_share(caster: _Caster, origins: Float, light: Light) -> Float:
 
 
 def _disc_pattern(light: Light, count: int) -> Float:
-    """(count, 3) directions over the disc in equal areas: Vogel's spiral, golden angle between neighbours."""
+    """(count, 3) directions over the disc in equal areas: Vogel's spiral, golden angle between
+    neighbours.
+    """
     index = np.arange(count)
     angle = index * np.pi * (3 - np.sqrt(5))
     radius = np.sqrt((index + 0.5) / count)
@@ -251,7 +265,9 @@ def _disc_points(light: Light, points: npt.NDArray[np.float64]) -> Float:
 
 
 def _corner_occlusion(mesh: Mesh, caster: _Caster) -> Float:
-    """(faces, 3): share of the sky above each corner, weighted by the cosine; once per vertex and normal."""
+    """(faces, 3): share of the sky above each corner, weighted by the cosine; once per vertex and
+    normal.
+    """
     pairs = np.concatenate([mesh.corners, mesh.normals], axis=2).reshape(-1, 6)
     unique, back = np.unique(pairs, axis=0, return_inverse=True)
     position, normal = unique[:, :3], unique[:, 3:]
@@ -264,7 +280,9 @@ def _corner_occlusion(mesh: Mesh, caster: _Caster) -> Float:
     sphere = np.stack([ring * np.cos(angle), ring * np.sin(angle), z], axis=1).astype(np.float32)
     seen = np.zeros(len(unique), np.float32)
     for point in sphere:
-        seen += ~caster.blocked(origins, np.ascontiguousarray(_unit(normal * np.float32(1.001) + point)))
+        seen += ~caster.blocked(
+            origins, np.ascontiguousarray(_unit(normal * np.float32(1.001) + point))
+        )
     share: Float = (seen / OCCLUSION_RAYS)[back.reshape(-1)].reshape(-1, 3)
     return share
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import tempfile
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +9,7 @@ import numpy.typing as npt
 from PIL import Image
 
 from kernels.gbuffer import GBuffer
+from traces.files import replacing, writing
 
 Rgb8 = npt.NDArray[np.uint8]
 
@@ -18,7 +17,8 @@ Rgb8 = npt.NDArray[np.uint8]
 def tone_map(linear: npt.NDArray[np.float32], exposure: float = 1.0) -> Rgb8:
     """Linear RGB (h, w, 3) to sRGB bytes.
 
-    Values up to half the range pass unchanged; above, a shoulder bends highlights into the rest of it.
+    Values up to half the range pass unchanged; above, a shoulder bends highlights into the rest of
+    it.
     """
     value = np.maximum(linear * np.float32(exposure), 0.0)
     knee = np.float32(0.5)
@@ -31,18 +31,16 @@ def tone_map(linear: npt.NDArray[np.float32], exposure: float = 1.0) -> Rgb8:
 
 
 def preview(gbuffer: GBuffer) -> Rgb8:
-    """The scene without scattering: irradiance x albedo + the rest, tone-mapped; (h, w, 3) sRGB bytes."""
+    """The scene without scattering: irradiance x albedo + the rest, tone-mapped; (h, w, 3) sRGB
+    bytes.
+    """
     return tone_map(gbuffer.irradiance * gbuffer.albedo + gbuffer.non_subsurface)
 
 
 def save_png(path: str | Path, picture: Rgb8) -> None:
-    """Write (h, w, 3) or (h, w) bytes as PNG, whole or not at all. Raises OSError."""
-    path = Path(path)
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    try:
-        with os.fdopen(handle, "wb") as file:
-            Image.fromarray(picture).save(file, format="PNG")
-        os.replace(temporary, path)
-    except BaseException:
-        os.unlink(temporary)
-        raise
+    """Write (h, w, 3) or (h, w) bytes as PNG, whole or not at all.
+
+    Raises InputError where the folder cannot be written to, WorkError where writing fails.
+    """
+    with replacing(path) as part, writing(path):
+        Image.fromarray(picture).save(part, format="PNG")

@@ -32,14 +32,14 @@ typedef uint8 word;
 #define to_whole convert_int8
 #define to_word convert_uint8
 #define GATHER(type, memory, at) \
-    ((type##8)((memory)[(at).s0], (memory)[(at).s1], (memory)[(at).s2], (memory)[(at).s3], (memory)[(at).s4], \
-               (memory)[(at).s5], (memory)[(at).s6], (memory)[(at).s7]))
+    ((type##8)((memory)[(at).s0], (memory)[(at).s1], (memory)[(at).s2], (memory)[(at).s3], \
+               (memory)[(at).s4], (memory)[(at).s5], (memory)[(at).s6], (memory)[(at).s7]))
 #endif
 
 #define LN2_HIGH 0x1.62ep-1f             // 12 bits of ln 2: exact when multiplied by an exponent
 #define LN2_LOW 0x1.0bfbe8p-15f          // ln 2 - LN2_HIGH
 #define LOG2_E 0x1.715476p+0f
-#define ROUND_TO_INTEGER 0x1.8p+23f      // added to a small number, it leaves the nearest integer in the low bits
+#define ROUND_TO_INTEGER 0x1.8p+23f      // added, it leaves the nearest integer in the low bits
 #define SQRT_HALF_BITS 0x3f3504f3
 #define TURN_TO_RADIANS 0x1.921fb6p-30f  // 2 pi / 2^32
 

@@ -11,9 +11,12 @@ int2 find_tap(int at, int source_size, int size, float *weight)
     return (int2)(left, min(left + 1, source_size - 1));
 }
 
+#define LOAD(texel_y, texel_x) \
+    load_setup(setup_texture, setup_index(source_level, texel_y, texel_x, full_width, full_height))
+
 PASS_KERNEL prefilter(
-    WARP_ARGS, __global ushort *setup_texture, const uint source_level, const int full_width, const int full_height
-    TRACE_ARGS)
+    WARP_ARGS, __global ushort *setup_texture, const uint source_level, const int full_width,
+    const int full_height TRACE_ARGS)
 {
     FIND_PIXEL
     FIND_ROW
@@ -24,15 +27,14 @@ PASS_KERNEL prefilter(
     const int2 taps_y = find_tap(inside ? y : 0, source_height, height, &weight_y);
     TRACE(1, inside, source_level, taps_y.x, taps_x.x)
     if (inside) {
-        const float4 a = load_setup(setup_texture, setup_index(source_level, taps_y.x, taps_x.x, full_width, full_height));
-        const float4 b = load_setup(setup_texture, setup_index(source_level, taps_y.x, taps_x.y, full_width, full_height));
-        const float4 c = load_setup(setup_texture, setup_index(source_level, taps_y.y, taps_x.x, full_width, full_height));
-        const float4 d = load_setup(setup_texture, setup_index(source_level, taps_y.y, taps_x.y, full_width, full_height));
+        const float4 a = LOAD(taps_y.x, taps_x.x);
+        const float4 b = LOAD(taps_y.x, taps_x.y);
+        const float4 c = LOAD(taps_y.y, taps_x.x);
+        const float4 d = LOAD(taps_y.y, taps_x.y);
         const float4 top = a * (1.0f - weight_x) + b * weight_x;
         const float4 bottom = c * (1.0f - weight_x) + d * weight_x;
-        store_setup(
-            (__global half *)setup_texture, setup_index(source_level + 1u, y, x, full_width, full_height),
-            top * (1.0f - weight_y) + bottom * weight_y);
+        const uint target = setup_index(source_level + 1u, y, x, full_width, full_height);
+        store_setup((__global half *)setup_texture, target, top * (1.0f - weight_y) + bottom * weight_y);
     }
     TRACE(1, inside, source_level + 1u, y, x)
 }

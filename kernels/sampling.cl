@@ -44,7 +44,8 @@ real decode_half(word bits)
 real invert_cdf(real complement)
 {
 #if INVERSE_EXACT
-    const real g = poly_cbrt(1.0f + 4.0f * complement * (2.0f * complement + sqrt(1.0f + 4.0f * complement * complement)));
+    const real root = sqrt(1.0f + 4.0f * complement * complement);
+    const real g = poly_cbrt(1.0f + 4.0f * complement * (2.0f * complement + root));
     return 3.0f * poly_log((1.0f + 1.0f / g + g) / (4.0f * complement));
 #else
     return ((2.0f - APPROXIMATE_C) * (1.0f - complement) - 2.0f) * poly_log(complement);
@@ -110,11 +111,13 @@ word pack_texels(whole mip, whole texel_y, whole texel_x)
 // of level l, its width (2 l) and height (2 l + 1) over level 0's. _r, _g, _b, _s: red, green, blue
 // and the sampled channel.
 __kernel __attribute__((reqd_work_group_size(32 / WIDTH, 1, 1))) void sampling(
-    WARP_ARGS, __global const uint *setup_texture, __global const uint *normal, __global const uchar *profile_id,
-    __global const ushort *counts, __global const float *velocity, __global half *scattered, const int has_velocity,
-    const int fixed_count, const uint frame, const int num_levels, __global const float *ratio, const float texels_per_mm_at_cm,
-    const float d, const float rate_r, const float rate_g, const float rate_b, const float rate_s, const float density_r,
-    const float density_g, const float density_b, const float density_s, const float mip_scale TRACE_ARGS)
+    WARP_ARGS, __global const uint *setup_texture, __global const uint *normal,
+    __global const uchar *profile_id, __global const ushort *counts, __global const float *velocity,
+    __global half *scattered, const int has_velocity, const int fixed_count, const uint frame,
+    const int num_levels, __global const float *ratio, const float texels_per_mm_at_cm, const float d,
+    const float rate_r, const float rate_g, const float rate_b, const float rate_s,
+    const float density_r, const float density_g, const float density_b, const float density_s,
+    const float mip_scale TRACE_ARGS)
 {
     const uint warp = first_warp + (uint)get_group_id(0);
     const int steps = warp_steps[warp];
@@ -224,7 +227,8 @@ __kernel __attribute__((reqd_work_group_size(32 / WIDTH, 1, 1))) void sampling(
 #if MIP_RULE == 1
             const whole level = find_level(p * mip_factor, num_levels);  // Eq 5.12
 #else
-            const whole level = find_level(p * mip_factor / r, num_levels);  // [KC08] samples per texel of level 0
+            // [KC08]: samples per texel of level 0.
+            const whole level = find_level(p * mip_factor / r, num_levels);
 #endif
             const whole level_x = to_whole(at_x * GATHER(float, ratio, 2 * level));
             const whole level_y = to_whole(at_y * GATHER(float, ratio, 2 * level + 1));
@@ -291,8 +295,10 @@ __kernel __attribute__((reqd_work_group_size(32 / WIDTH, 1, 1))) void sampling(
     const whole target = inside ? pixel : (whole)(-1);
     const real kept = to_real(count);
 #if WIDTH == 1
-    if (target >= 0)
-        store_half(scattered, target, count > 0 ? (float4)(result_r, result_g, result_b, kept) : (float4)(0.0f));
+    if (target >= 0) {
+        const float4 result = (float4)(result_r, result_g, result_b, kept);
+        store_half(scattered, target, count > 0 ? result : (float4)(0.0f));
+    }
 #else
     float red[8], green[8], blue[8], samples[8];
     int targets[8];
@@ -302,9 +308,10 @@ __kernel __attribute__((reqd_work_group_size(32 / WIDTH, 1, 1))) void sampling(
     vstore8(kept, 0, samples);
     vstore8(target, 0, targets);
     for (int k = 0; k < 8; ++k) {
-        if (targets[k] >= 0)
-            store_half(
-                scattered, targets[k], samples[k] > 0.0f ? (float4)(red[k], green[k], blue[k], samples[k]) : (float4)(0.0f));
+        if (targets[k] >= 0) {
+            const float4 result = (float4)(red[k], green[k], blue[k], samples[k]);
+            store_half(scattered, targets[k], samples[k] > 0.0f ? result : (float4)(0.0f));
+        }
     }
 #endif
 }

@@ -1,8 +1,8 @@
 // Set-up: split the frame into the setup texture (irradiance and depth, 0 where nothing scatters)
 // and the profile-id cache.
 PASS_KERNEL setup(
-    WARP_ARGS, __global const half *scene_light, __global const float *depth, __global const uchar *gbuffer_id,
-    __global half *setup_texture, __global uchar *profile_id TRACE_ARGS)
+    WARP_ARGS, __global const half *scene_light, __global const float *depth,
+    __global const uchar *gbuffer_id, __global half *setup_texture, __global uchar *profile_id TRACE_ARGS)
 {
     FIND_PIXEL
     FIND_ROW
