@@ -2,10 +2,12 @@
 
     trace ──► dispatch ──► coalesce ──► levels above ──► line stream ──► next uses ──► OPT
 
-OPT evicts the line whose next use is farthest away [Belady 1966]. Every missed line is inserted: bypassing the cache, which could
-miss less still, is not considered. Counted are loads at line granularity: one access per request to a line, whatever its sectors.
-Stores and atomics at the bounded level are left out of its stream, for OPT and for the policies beside it; the levels above run as
-configured, so that the L2's stream is what the configured L1 passes down, fetches for stores included.
+OPT evicts the line whose next use is farthest away [Belady 1966]. Every missed line is inserted:
+bypassing the cache, which could miss less still, is not considered. Counted are loads at line
+granularity: one access per request to a line, whatever its sectors. Stores and atomics at the
+bounded level are left out of its stream, for OPT and for the policies beside it; the levels above
+run as configured, so that the L2's stream is what the configured L1 passes down, fetches for stores
+included.
 """
 
 from __future__ import annotations
@@ -20,7 +22,8 @@ from cachesim import cache, presets
 from cachesim.coalesce import groups_of, placement_of, program_of
 from cachesim.config import Gpu
 from cachesim.dispatch import Dispatcher
-from cachesim.hierarchy import BATCH_ROWS, Hierarchy, Level
+from cachesim.hierarchy import BATCH_ROWS, Hierarchy
+from cachesim.level import Level
 from cachesim.optimal import LineStream
 from cachesim.simulate import FETCH_PATHS, hierarchy_levels
 from cachesim.stream import GROUP_BITS, LOAD, Outcome, Requests
@@ -37,8 +40,8 @@ _U32 = np.uint32
 class Bound:
     """Line misses of one level under OPT, LRU and its own policy, over the same loads.
 
-    level: "l1" or "l2". accesses: load requests looked up there. misses: OPT's, the bound. lru_misses: LRU's. policy: the level's
-    own `replacement`; policy_misses: its misses.
+    level: "l1" or "l2". accesses: load requests looked up there. misses: OPT's, the bound.
+    lru_misses: LRU's. policy: the level's own `replacement`; policy_misses: its misses.
     """
 
     level: str
@@ -75,12 +78,14 @@ def belady(
 ) -> Bound:
     """Bound the line misses of a trace's loads at one level of a GPU.
 
-    The trace is read once. Its line stream (the L1's of one launch at a time, as L1s start empty at each; the L2's whole) lies in
-    temporary files, 20 bytes per request; in memory are 17 bytes per request of the busiest set, twice that for its distinct
-    lines, and the caches.
+    The trace is read once. Its line stream (the L1's of one launch at a time, as L1s start empty at
+    each; the L2's whole) lies in temporary files, 20 bytes per request. In memory are the caches,
+    and for the busiest set up to 105 bytes per request.
 
     Args:
-        level: "l1" or "l2". fetch_path, layout: as in `simulate`. progress: called with the number of lane fetches read so far.
+        level: "l1" or "l2".
+        fetch_path, layout: as in `simulate`.
+        progress: called with the number of lane fetches read so far.
 
     Raises:
         InputError: an unknown GPU, level, fetch path or layout, or a trace that does not fit.
@@ -161,20 +166,27 @@ def _run(
 
 
 class _RecordedLevel(Level):
-    """The bounded level: it writes down its stream of loads, and counts LRU's and its own policy's misses of whole lines."""
+    """The bounded level: it writes down its stream of loads instead of caching, and counts the
+    misses of whole lines under LRU and under its own policy.
+    """
 
     def __init__(self, level: Level, stream: LineStream) -> None:
+        caches = 1 if level.partition is not None else level.rules.num_instances
+        skips = bool(level.rules.bypass_loads)
+        super().__init__(
+            level.name, level.config, caches, 1, by_slice=level.by_slice, bypass_loads=skips
+        )
         whole_lines = {"sector_bytes": level.config.line_bytes, "write_policy": "read-only"}
         self._policies = {
             name: Level(
                 level.name,
                 level.config.model_copy(update={**whole_lines, "replacement": name}),
-                level.rules.num_instances,
+                caches,
                 1,
+                by_slice=level.by_slice,
             )
             for name in dict.fromkeys(("lru", level.config.replacement))
         }
-        self.__dict__.update(vars(level))
         self._stream = stream
         self._accesses = self._misses = 0
 

@@ -167,7 +167,7 @@ def empty_outcome(rules: CacheRules, num_requests: int) -> Outcome:
         down=np.zeros(num_requests, np.uint8),
         fill=np.zeros(0 if rules.bypass_stores else num_requests, np.uint8),
         evicted_line=np.zeros(evictions, np.uint64),
-        evicted_owner=np.full((evictions, 8), -1, np.int32),
+        evicted_owner=np.zeros((evictions, 8), np.int32),
         evicted_bytes=np.zeros((evictions, 8), np.uint32),
     )
 
@@ -193,7 +193,7 @@ def _evict(  # type: ignore[no-untyped-def]
     for s in range(sectors_per_line):
         if (dirty >> U8(s)) & U8(1):
             counters[owner[line, s], WRITEBACKS] += 1
-            evicted_owner[i, s] = owner[line, s]
+            evicted_owner[i, s] = owner[line, s] + 1
             full = (flags[line * U64(32) + VALID] >> U8(s)) & U8(1)
             evicted_bytes[i, s] = all_bytes if full else bytes_held[line, s]
     flags[line * U64(32) + DIRTY] = 0

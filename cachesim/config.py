@@ -84,8 +84,9 @@ class CacheLevel(_Model):
     def _geometry_fits(self) -> Self:
         for field in ("line_bytes", "sector_bytes"):
             value = getattr(self, field)
-            if value & (value - 1) or value > 4096:
-                raise ValueError(f"{field} = {value}: allowed are powers of two up to 4096")
+            if value & (value - 1) or not 16 <= value <= 4096:
+                # A texel has up to 16 bytes; smaller sectors would split it.
+                raise ValueError(f"{field} = {value}: allowed are powers of two from 16 to 4096")
         if self.line_bytes % self.sector_bytes:
             raise ValueError(
                 f"sector_bytes = {self.sector_bytes} does not divide line_bytes = {self.line_bytes}"

@@ -126,12 +126,14 @@ class Hierarchy:
             pool.shutdown(wait=True, cancel_futures=True)
 
     def end_launch(self) -> None:
-        """L1s start empty at each launch: write back what is dirty in them, forget the rest."""
+        """L1s (and GL1s) start empty at each launch: write back what is dirty, forget the rest; sliced levels are kept."""
         self.drain()
         top = self.levels[0]
         if top.rules.can_be_dirty and top.state.flags[cache.DIRTY :: 32].any():
             self._write_back_all(0)
-        cache.reset(top.state, top.rules)
+        for level in self.levels:
+            if level.partition is None:
+                cache.reset(level.state, level.rules)
 
     def _timed(self, stage: str, work: Callable[..., None], *arguments: Any) -> None:
         start = time.thread_time()
@@ -275,7 +277,7 @@ class Hierarchy:
             dirty = (state.flags[cache.DIRTY :: 32][lines] >> s) & 1 == 1
             owner = state.owner[lines[dirty], s]
             np.add.at(level.counters[:, cache.WRITEBACKS], owner, 1)
-            buffer.outcome.evicted_owner[dirty, s] = owner
+            buffer.outcome.evicted_owner[dirty, s] = owner + 1
             full = (state.flags[cache.VALID :: 32][lines] >> s) & 1 == 1
             buffer.outcome.evicted_bytes[:, s] = np.where(
                 full, rules.all_bytes, state.bytes_held[lines, s]

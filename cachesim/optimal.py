@@ -1,6 +1,7 @@
-"""OPT over a line stream: set by set, each line's next use, then the evictions of the farthest [Belady 1966].
+"""Belady's OPT over a line stream: set by set, when each line is used next, then which to evict.
 
-Every missed line is inserted; bypassing the cache is not considered.
+A miss evicts the resident whose next use is farthest away [Belady 1966]. Every missed line is
+inserted; bypassing the cache is not considered.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ _U64 = np.uint64
 
 
 class LineStream:
-    """A sequence of (line, set) pairs in two temporary files, 12 bytes a pair; OPT needs 8 more for a while."""
+    """A sequence of (line, set) pairs in two temporary files, 12 bytes a pair; OPT takes 8 more."""
 
     def __init__(self) -> None:
         self._lines = tempfile.TemporaryFile()
@@ -32,7 +33,11 @@ class LineStream:
         self._sets.close()
 
     def append(self, line: npt.NDArray[np.uint64], cache_set: npt.NDArray[np.uint32]) -> None:
-        """Write more pairs. line: (n,) uint64 line numbers; cache_set: (n,) uint32, set among those of all instances."""
+        """Write more pairs.
+
+        line: (n,) uint64 line numbers. cache_set: (n,) uint32, the set among those of all
+            instances.
+        """
         self._lines.write(line.tobytes())
         self._sets.write(cache_set.astype(np.uint32, copy=False).tobytes())
         self.num_requests += len(line)
@@ -62,7 +67,10 @@ class LineStream:
 
 @njit(cache=True, nogil=True)
 def _group_by_set(line, cache_set, starts, out):  # type: ignore[no-untyped-def]
-    """Write the lines of each set to out, in order, set after set; starts: (num_sets + 1,) zeros, becomes where each set begins."""
+    """Write the lines of each set to out, in order, set after set.
+
+    starts: (num_sets + 1,) int64 zeros, becomes where each set begins.
+    """
     for i in range(len(line)):
         starts[cache_set[i] + 1] += 1
     for s in range(1, len(starts)):
@@ -77,7 +85,8 @@ def _group_by_set(line, cache_set, starts, out):  # type: ignore[no-untyped-def]
 def _next_uses(line, begin, end, stamp, key, position, owner, next_use):  # type: ignore[no-untyped-def]
     """Where each line of one set's stream is used next, counted from begin, or `_NEVER`.
 
-    key, position, owner: a hash table of a power of two of entries; an entry is of this set where owner is `stamp`.
+    key, position, owner: a hash table of a power of two of entries; an entry is of this set where
+        owner is `stamp`.
     """
     last = _U64(len(key) - 1)
     for t in range(end - begin - 1, -1, -1):
@@ -118,9 +127,10 @@ def _push(heap, size, value):  # type: ignore[no-untyped-def]
 def _misses_of_set(next_use, num, ways, expected, heap):  # type: ignore[no-untyped-def]
     """OPT's misses of one set.
 
-    expected: (num,) uint8, 1 where the line used then is resident and waits for that use. heap: (2 ways + 2,) int64, the uses that
-    residents wait for, farthest first; entries in the past are left behind by hits and never reach the top, as any resident with
-    a use ahead stands above them.
+    expected: (num,) uint8, 1 where the line used then is resident and waits for that use.
+    heap: (2 ways + 2,) int64, the uses that residents wait for, farthest first. Entries in the past
+        are left behind by hits; they never reach the top, as any resident with a use ahead stands
+        above them.
     """
     expected[:num] = 0
     misses, resident, dead, size = 0, 0, 0, 0
@@ -157,7 +167,7 @@ def _misses_of_set(next_use, num, ways, expected, heap):  # type: ignore[no-unty
 
 @njit(cache=True, nogil=True)
 def _optimal_misses(line, starts, ways):  # type: ignore[no-untyped-def]
-    """OPT's misses of all sets. line: streams of all sets, set after set; starts: (num_sets + 1,) int64."""
+    """OPT's misses of all sets. line: their streams, set after set; starts: (num_sets + 1,)."""
     longest = 0
     for s in range(len(starts) - 1):
         longest = max(longest, starts[s + 1] - starts[s])

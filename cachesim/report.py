@@ -54,8 +54,13 @@ class LevelCounters:
 
     @property
     def presented(self) -> int:
-        """Sectors that arrived at this level: its demand."""
+        """Sectors that arrived at this level, those that go around it included."""
         return self.accesses + self.bypasses
+
+    @property
+    def demand_bytes(self) -> int:
+        """Bytes asked of this level; what goes around it is no demand on it."""
+        return self.accesses * self.sector_bytes
 
     @property
     def reads_down(self) -> int:
@@ -144,11 +149,8 @@ class Report:
 
     @property
     def demand(self) -> dict[str, int]:
-        """Demand in bytes: the sectors presented to each level, and those that DRAM moved; lane fetches as a count."""
-        presented = {f"{n}_bytes": c.presented * c.sector_bytes for n, c in self.counters.items()}
-        if self.counters["l1"].accesses == 0:
-            # Where everything bypasses the L1, nothing is presented to it (`Fetch path`).
-            presented["l1_bytes"] = 0
+        """Demand in bytes: of each level the sectors looked up there, of DRAM those moved; lane fetches as a count."""
+        presented = {f"{n}_bytes": c.demand_bytes for n, c in self.counters.items()}
         return {"lane_fetches": self.lane_fetches, **presented, "dram_bytes": self.dram.bytes}
 
     def check(self) -> None:
@@ -224,7 +226,7 @@ class Report:
     def frame(self) -> pd.DataFrame:
         """One row per level: the counters, `misses`, `miss_rate` and `demand_bytes`."""
         rows = [
-            {"level": n, **c.to_json(), "demand_bytes": self.demand[f"{n}_bytes"]}
+            {"level": n, **c.to_json(), "demand_bytes": c.demand_bytes}
             for n, c in self.counters.items()
         ]
         return pd.DataFrame(rows).astype({"miss_rate": float})
@@ -240,7 +242,7 @@ class Report:
                 "lane_fetches": p.lane_fetches,
             }
             rows += [
-                {**key, "level": n, **c.to_json(), "bytes": c.presented * c.sector_bytes}
+                {**key, "level": n, **c.to_json(), "bytes": c.demand_bytes}
                 for n, c in p.counters.items()
             ]
             rows.append({**key, "level": "dram", **p.dram.to_json()})

@@ -105,10 +105,10 @@ def pass_down(  # type: ignore[no-untyped-def]
             if len(outcome.evicted_owner):
                 first = True
                 for s in range(sectors):
-                    owner = outcome.evicted_owner[i, s]
+                    owner = outcome.evicted_owner[i, s] - 1
                     if owner < 0:
                         continue
-                    outcome.evicted_owner[i, s] = -1
+                    outcome.evicted_owner[i, s] = 0
                     if s > 0 and not first:
                         first = meta[num - U64(1)] & U32(GROUP_MASK) != U32(owner)
                     num, stores = _append(

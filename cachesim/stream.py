@@ -48,7 +48,7 @@ class Outcome(NamedTuple):
 
     down: (n,) uint8, sectors of the request's line that go to the next level as the request's own operation, or as a load where
         `fill` is set. fill: (n,) uint8, sectors to fetch so that a store can be merged.
-    evicted_line: (n,) uint64, and per sector evicted_owner: (n, 8) int32, group that dirtied it, -1 = not written back;
+    evicted_line: (n,) uint64, and per sector evicted_owner: (n, 8) int32, 1 + the group that dirtied it, 0 = not written back;
     evicted_bytes: (n, 8) uint32, the bytes it holds. Empty arrays where the level cannot hold dirty lines.
     """
 

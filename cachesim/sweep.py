@@ -1,9 +1,9 @@
 """Sweep: one trace counted over a grid of configurations, a few at a time, on all cores.
 
-    axes ──► grid of checked GPUs ──► batches ──► one pass over the trace per batch ──► rows in grid order
+    axes ──► grid of checked GPUs ──► batches ──► a pass over the trace each ──► rows in grid order
 
-A trace in a file is opened by every worker process anew; a trace in memory, or a live recording, is read by this process, once
-per batch, with the batch's GPUs side by side in threads.
+A trace in a file is opened by every worker process anew. A trace in memory, or a live recording, is
+read by this process, once per batch, with the batch's GPUs side by side in threads.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import os
 import signal
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from multiprocessing.synchronize import Event
 from pathlib import Path
@@ -26,7 +27,7 @@ from cachesim.config import Gpu
 from cachesim.dispatch import resident_ctas
 from cachesim.report import Report
 from cachesim.simulate import FETCH_PATHS, simulate_all
-from traces.errors import InputError, unknown
+from traces.errors import InputError, WorkError, unknown
 from traces.layout import layout_function
 from traces.open import open_trace
 from traces.trace import Trace
@@ -54,20 +55,26 @@ def sweep(
     Args:
         trace: a file (what many cores are best used with), or a Trace.
         gpu: the machine that the axes vary, or the name of a preset.
-        axes: field path -> values, as `presets.with_fields` takes them: {"l1.capacity": [16384, 32768], "llc": [None]}.
+        axes: field path -> values, as `presets.with_fields` takes them:
+            {"l1.capacity": [16384, 32768], "l1.ways": [4, 8]}.
         fetch_path, layout: as in `simulate`.
-        num_workers: processes (threads for a Trace); None takes all cores. With 1 everything runs in this process.
-            Scripts that use more need the usual `if __name__ == "__main__":`, as worker processes import the main module.
-        progress: called with the number of points done. on_row: called with each row when it is done, in any order; what it
-            kept is what an interrupted sweep has.
+        num_workers: processes (threads for a Trace); None takes all cores. With 1 everything runs
+            in this process. A script that uses more needs the usual `if __name__ == "__main__":`,
+            as worker processes import the main module.
+        progress: called with the number of points done.
+        on_row: called with each row when it is done, in any order; what it kept is what an
+            interrupted sweep leaves.
 
     Returns:
-        One row per point, in grid order, the last axis fastest: the axes' columns, then the counters of each level
-        ("l1.accesses", "l1.miss_rate", ...), "dram.*" and "demand.*". A level that a point lacks is NaN there.
+        One row per point, in grid order, the last axis fastest: the axes' columns, then the
+        counters of each level ("l1.accesses", "l1.miss_rate", ...), "dram.*" and "demand.*". A
+        level that a point lacks is NaN there.
 
     Raises:
-        InputError: before any work starts, for an axis without values, an unknown field, or a point whose values do not fit
-            together or cannot hold the trace's CTAs, which it names; and what reading the trace raises.
+        InputError: before any work starts, for an axis without values, an unknown field, or a
+            point whose values do not fit together or cannot hold the trace's CTAs, which it names;
+            and what reading the trace raises.
+        WorkError: a worker process died.
         KeyboardInterrupt: after the workers have stopped.
     """
     if fetch_path is not None and fetch_path not in FETCH_PATHS:
@@ -110,7 +117,7 @@ def grid(gpu: Gpu | str, axes: Mapping[str, Sequence[Any]]) -> list[tuple[Row, G
 
 
 def flat_counters(report: Report) -> Row:
-    """A report as one row: "l1.accesses" and so on for every level, then "dram.*" and "demand.*"."""
+    """A report as one row: "l1.accesses" and so on for all levels, then "dram.*" and "demand.*"."""
     sections: dict[str, Mapping[str, Any]] = {
         **{name: counters.to_json() for name, counters in report.counters.items()},
         "dram": report.dram.to_json(),
@@ -178,7 +185,7 @@ def _count_in_processes(
     fetch_path: str | None,
     layout: str | None,
 ) -> Iterator[list[tuple[int, Report]]]:
-    """Count batches in worker processes; an interrupt, or an error of one, stops them all before it goes on."""
+    """Count batches in worker processes; an interrupt, or an error of one, stops them all first."""
     context = multiprocessing.get_context("spawn")
     stop = context.Event()
     with ProcessPoolExecutor(
@@ -191,6 +198,8 @@ def _count_in_processes(
                 ]
             for future in as_completed(futures):
                 yield future.result()
+        except BrokenProcessPool as error:
+            raise WorkError("sweep: a worker process died, for want of memory perhaps") from error
         except BaseException:
             stop.set()
             pool.shutdown(wait=True, cancel_futures=True)
@@ -199,7 +208,10 @@ def _count_in_processes(
 
 @contextmanager
 def _interrupts_held() -> Iterator[None]:
-    """Hold Ctrl-C back for a moment: processes and threads started meanwhile never see it, this process does after."""
+    """Hold Ctrl-C back for a moment.
+
+    Processes started meanwhile inherit that and never see it; this process does after.
+    """
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield

@@ -156,7 +156,7 @@ def _totals(report: Report, passes: str) -> dict[str, Any]:
         parts = [p for p in report.parts or () if p.pass_name == passes]
         counters = {level: sum_parts(parts, level) for level in report.levels}
         row = {"lane_fetches": sum(p.lane_fetches for p in parts)}
-        row |= {f"{n}_bytes": c.presented * c.sector_bytes for n, c in counters.items()}
+        row |= {f"{n}_bytes": c.demand_bytes for n, c in counters.items()}
         row["dram_bytes"] = sum(p.dram.bytes for p in parts)
     return row | {f"{name}_miss_rate": c.miss_rate for name, c in counters.items()}
 
@@ -198,5 +198,5 @@ def _part_row(label: str, report: Report, method: str, part: Part) -> dict[str, 
         counts = part.counters[level]
         row[f"{level}_accesses"] = counts.accesses
         row[f"{level}_misses"] = counts.misses
-        row[f"{level}_bytes"] = counts.presented * counts.sector_bytes
+        row[f"{level}_bytes"] = counts.demand_bytes
     return row

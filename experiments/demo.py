@@ -115,27 +115,24 @@ def write_results(
     from experiments import adaptive_vs_fixed as study
     from experiments import plots
     from experiments.console import console, remark
-    from experiments.output import write_figure
-    from experiments.tables import print_table, write_table
+    from experiments.output import write_figure, write_text
+    from experiments.tables import csv, print_table, write_table
     from kernels.picture import preview, save_png, tone_map
 
     demand = study.demand_frame(results)
     ratios = study.ratio_frame(demand)
     mips = study.mip_frame(results)
     quality = study.quality_frame(results)
+    title = f"Fixed 64 against adaptive at {size}"
     shown = {
         "quality": (tables.quality_table(quality, f"Scenes at {size}", num_frames), quality),
-        "demand": (
-            tables.demand_table(demand, ratios, f"Fixed 64 against adaptive at {size}", size),
-            demand,
-        ),
-        "ratios": (None, ratios),
+        "demand": (tables.demand_table(demand, ratios, title, size), demand),
         "mips": (tables.mip_table(mips, f"By mip at {size}"), mips),
     }
     for name, (table, data) in shown.items():
-        if table is not None:
-            print_table(table)
-            write_table(table, folder / name, data)
+        print_table(table)
+        write_table(table, folder / name, data)
+    write_text(folder / "ratios.csv", csv(ratios))
     for result in results:
         attribution = result.gbuffer.attribution
         save_png(folder / f"{result.label}-unscattered.png", preview(result.gbuffer))

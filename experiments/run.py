@@ -136,7 +136,7 @@ def by_wide(report: Report) -> pd.DataFrame:
             "lane_fetches_m": part.lane_fetches / 1e6,
         }
         for level, counts in part.counters.items():
-            row[f"{level}_mb"] = counts.presented * counts.sector_bytes / 1e6
+            row[f"{level}_mb"] = counts.demand_bytes / 1e6
             row[f"{level}_miss_rate"] = counts.miss_rate
         row["dram_mb"] = part.dram.bytes / 1e6
         rows.append(row)

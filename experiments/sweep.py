@@ -48,18 +48,37 @@ def command(
             raise InputError(f"--axis {text!r}: {field} has an axis already")
         axes[field] = values
     num_points = math.prod(len(values) for values in axes.values())
+    done: list[dict[str, object]] = []
     with progress(f"counting {num_points} configurations", num_points) as bar:
-        frame = sweep(
-            trace,
-            machine,
-            axes,
-            fetch_path=fetch_path,
-            layout=layout,
-            num_workers=workers,
-            progress=bar.update,
-        )
+        try:
+            frame = sweep(
+                trace,
+                machine,
+                axes,
+                fetch_path=fetch_path,
+                layout=layout,
+                num_workers=workers,
+                progress=bar.update,
+                on_row=done.append,
+            )
+        except KeyboardInterrupt:
+            keep_finished(done, output)
+            raise
     picture = output.with_suffix(".png")
     figure = sweep_figure(frame, list(axes), f"{trace.name} on {machine.name}")
     write_figure(picture, figure)
     write_text(output, frame.to_csv(index=False))
     remark(f"{num_points} configurations: wrote {output} and {picture}")
+
+
+def keep_finished(rows: list[dict[str, object]], output: Path) -> None:
+    """Write the rows of an interrupted sweep beside `output`, as NAME.partial.csv."""
+    import pandas as pd
+
+    from experiments.console import remark
+    from experiments.output import write_text
+
+    if rows:
+        partial = output.with_suffix(".partial.csv")
+        write_text(partial, pd.DataFrame(rows).to_csv(index=False))
+        remark(f"kept the {len(rows)} finished configurations in {partial}")

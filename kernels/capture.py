@@ -68,9 +68,12 @@ def load_npz(path: str | Path, projection_x: float | None = None) -> GBuffer:
 def save_npz(path: str | Path, gbuffer: GBuffer) -> None:
     """Write all of a G-buffer, compressed; whole or not at all. Raises InputError or WorkError."""
     arrays: dict[str, Any] = {name: getattr(gbuffer, name) for name in CHANNELS}
-    texts = {"name": np.array(gbuffer.name), "attribution": np.array(gbuffer.attribution)}
+    texts: dict[str, Any] = {
+        "name": np.array(gbuffer.name),
+        "attribution": np.array(gbuffer.attribution),
+    }
     with replacing(path) as part, writing(path), part.open("wb") as file:
-        np.savez_compressed(file, projection_x=np.float64(gbuffer.projection_x), **arrays, **texts)
+        np.savez_compressed(file, **arrays, **texts, projection_x=np.float64(gbuffer.projection_x))
 
 
 def load_exr(path: str | Path, projection_x: float | None = None) -> GBuffer:
@@ -80,7 +83,7 @@ def load_exr(path: str | Path, projection_x: float | None = None) -> GBuffer:
     missing channel, channels of different size, values that GBuffer refuses.
     """
     path = _existing(path)
-    import OpenEXR
+    import OpenEXR  # type: ignore[import-not-found]
 
     try:
         with OpenEXR.File(str(path), separate_channels=True) as file:

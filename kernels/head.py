@@ -7,9 +7,10 @@ from __future__ import annotations
 
 from functools import cache
 from importlib import resources
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import numpy.typing as npt
 
 from kernels.camera import Camera, check_size
 from kernels.device import Device, open_device
@@ -67,7 +68,7 @@ def render_head(
         flags.READ_ONLY | flags.COPY_HOST_PTR,
         hostbuf=lights if lights.size else np.zeros(8, np.float32),
     )
-    planes = {
+    planes: dict[str, Any] = {
         name: np.empty((height, width, channels) if channels > 1 else (height, width), np.float32)
         for name, channels in _PLANES.items()
     }
@@ -85,7 +86,7 @@ def render_head(
 
     for first_row in range(0, height, band_rows):
         rows = min(band_rows, height - first_row)
-        geometry = (
+        geometry: tuple[Any, ...] = (
             *view,
             np.int32(width),
             np.int32(height),
@@ -129,7 +130,7 @@ def _kernels(device: Device) -> tuple[cl.Kernel, cl.Kernel, cl.Buffer]:
     return cl.Kernel(program, "head_start"), cl.Kernel(program, "head_render"), grid
 
 
-def _view(camera: Camera, width: int) -> list[np.ndarray]:
+def _view(camera: Camera, width: int) -> list[npt.NDArray[Any]]:
     """Origin, right, up, forward as float4; .w of right and up is the size of a pixel at unit
     depth.
     """
@@ -143,7 +144,7 @@ def _view(camera: Camera, width: int) -> list[np.ndarray]:
     ]
 
 
-def _float4(values: tuple[float, ...] | np.ndarray) -> np.ndarray:
+def _float4(values: tuple[float, ...] | npt.NDArray[Any]) -> npt.NDArray[Any]:
     import pyopencl as cl
 
     vector = np.zeros((), cl.cltypes.float4)

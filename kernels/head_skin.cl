@@ -76,7 +76,7 @@ HEAD_INLINE float head_brow_mask(float3 q, float3 p)
     float inside = 1.0f - head_step(0.45f, 1.15f, head_over(fabs(q.y - arch), half_height));
     inside = inside * head_step(0.75f, 1.3f, x) * (1.0f - head_step(4.6f, 5.3f, x)) * head_step(4.0f, 5.0f, q.z);
     // Hairs lean outwards and up
-    float hair = head_tone((float3)((p.x > 0.0f ? x - q.y : x - q.y) * 9.0f, (q.y + 0.35f * x) * 3.0f, p.x > 0.0f ? 3.5f : 9.5f));
+    float hair = head_tone((float3)((x - q.y) * 9.0f, (q.y + 0.35f * x) * 3.0f, p.x > 0.0f ? 3.5f : 9.5f));
     return head_saturate(inside * (0.45f + 0.9f * hair));
 }
 
@@ -95,9 +95,9 @@ HEAD_INLINE float head_lip_mask(float3 q)
 HEAD_INLINE float head_hair_mask(float3 q, float3 p)
 {
     float ragged = 0.7f * (head_tone(p * 1.1f) - 0.5f) + 0.25f * (head_tone(p * 7.0f) - 0.5f);
-    float front = q.y - 7.2f + 0.10f * q.x * q.x * head_saturate(1.0f - 0.13f * q.x) + 0.0f;
+    float front = q.y - 7.2f + 0.10f * q.x * q.x * head_saturate(1.0f - 0.13f * q.x);
     float back = -1.6f - q.z + 0.55f * (q.y + 2.2f);
-    float side = fmin(q.x - 5.4f, fmin(q.y - 1.0f - 0.9f * (q.z - 1.5f), 1.2f * (5.2f - q.z) + 0.0f * q.y));
+    float side = fmin(q.x - 5.4f, fmin(q.y - 1.0f - 0.9f * (q.z - 1.5f), 1.2f * (5.2f - q.z)));
     float nape = q.y + 6.2f + ragged;
     float edge = fmax(fmax(front, side), fmin(back, nape)) + ragged;
     float3 e = head_ear_space(q);
@@ -138,7 +138,7 @@ HEAD_INLINE HeadSurface head_skin_surface(float3 p, float3 n, float footprint)
     albedo = albedo * (1.0f - (float3)(0.35f, 0.5f, 0.55f) * mole);
 
     // Beard shadow, cropped hair and brows darken the skin
-    float beard = head_step(-4.4f, -6.2f, q.y - 0.10f * q.x * q.x + 0.0f) * head_step(-13.0f, -11.5f, q.y)
+    float beard = head_step(-4.4f, -6.2f, q.y - 0.10f * q.x * q.x) * head_step(-13.0f, -11.5f, q.y)
                 * head_step(1.5f, 4.0f, q.z + 0.55f * (-q.y - 6.0f));
     float lips = head_lip_mask(q);
     beard = beard * (1.0f - lips) * 0.30f * (0.7f + 0.6f * head_tone(p * 9.0f));

@@ -1,6 +1,4 @@
-"""Meshes by path (glTF, OBJ, PLY): read, put upright, scaled to centimetres, with normals, tangents
-and maps.
-"""
+"""Meshes by path (glTF, OBJ, PLY): read, put upright, scaled to cm, with normals and maps."""
 
 from __future__ import annotations
 
@@ -185,8 +183,7 @@ def _rotation(up: str, forward: str, path: Path) -> npt.NDArray[np.float64]:
 
 
 def _head_box(points: npt.NDArray[np.float64]) -> tuple[npt.NDArray[np.float64], float]:
-    """Centre and height of the head: the upper part of a bust, the whole of a mesh without
-    shoulders.
+    """Centre and height of the head: the upper part of a bust, all of a mesh without shoulders.
 
     From the crown down to 1.5 times the breadth that is found in the upper two fifths of just that
     part, above the ears.
@@ -271,13 +268,14 @@ def _seams_fit_flipped(
 def _texture(mesh: trimesh.Trimesh) -> tuple[npt.NDArray[np.float64] | None, dict[str, Any]]:
     """(vertices, 2) uv or None, and what the material says: albedo, albedo_map, normal_map."""
     found: dict[str, Any] = {}
-    if mesh.visual.kind != "texture":
+    visual: Any = mesh.visual
+    if visual is None or visual.kind != "texture":
         return None, found
-    uv = getattr(mesh.visual, "uv", None)
+    uv = getattr(visual, "uv", None)
     uv = None if uv is None or len(uv) != len(mesh.vertices) else np.asarray(uv, dtype=np.float64)
     if uv is not None and not np.isfinite(uv).all():
         uv = None
-    material = mesh.visual.material
+    material = visual.material
     found["albedo_map"] = getattr(material, "baseColorTexture", None) or getattr(
         material, "image", None
     )

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from kernels.camera import Camera, camera_named, check_size
+from kernels.camera import Camera, Vector, camera_named, check_size
 from kernels.gbuffer import GBuffer
 from kernels.light import RIG, Light, Rig
 from kernels.mesh import HEAD_CM, Mesh, load_mesh
@@ -35,18 +35,18 @@ REFLECTANCE = np.float32(0.028)
 
 
 def mesh_camera(name: str, mesh: Mesh) -> Camera:
-    """One of the procedural head's views, moved and scaled with the bounding box of the mesh's
-    head.
+    """One of the procedural head's views, moved and scaled to the mesh's head.
 
     Raises InputError for another name.
     """
     view = camera_named(name)
     scale = mesh.head_height / HEAD_CM
-    position, target = (
-        tuple(float(x) for x in mesh.head_centre + scale * (np.array(point) - HEAD_CENTRE))
-        for point in (view.position, view.target)
-    )
-    return Camera(name, position, target, projection_x=view.projection_x)
+
+    def moved(point: Vector) -> Vector:
+        x, y, z = mesh.head_centre + scale * (np.array(point) - HEAD_CENTRE)
+        return float(x), float(y), float(z)
+
+    return Camera(name, moved(view.position), moved(view.target), projection_x=view.projection_x)
 
 
 def render_mesh(
@@ -111,8 +111,8 @@ class _Caster:
     """Embree's scene of one mesh."""
 
     def __init__(self, mesh: Mesh) -> None:
-        from embreex.mesh_construction import TriangleMesh
-        from embreex.rtcore_scene import EmbreeScene
+        from embreex.mesh_construction import TriangleMesh  # type: ignore[import-untyped]
+        from embreex.rtcore_scene import EmbreeScene  # type: ignore[import-untyped]
 
         self._scene = EmbreeScene(robust=True)
         self._triangles = TriangleMesh(self._scene, np.ascontiguousarray(mesh.corners))
@@ -129,16 +129,16 @@ class _Caster:
 
 
 def _primary_rays(camera: Camera, width: int, height: int, rows: slice) -> Rays:
-    """Directions reach unit depth along the view axis, so that the ray parameter is the linear
-    depth.
+    """Origins and directions, row by row. A direction is 1 long along the view axis, so that the
+    ray parameter is the linear depth.
     """
     right, up, forward = camera.basis()
     pixel = 2.0 / (width * camera.projection_x)
     x = (np.arange(width) + 0.5 - width / 2) * pixel
     y = (height / 2 - np.arange(rows.start, rows.stop) - 0.5) * pixel
     directions = forward + x[None, :, None] * right + y[:, None, None] * up
-    directions = directions.reshape(-1, 3).astype(np.float32)
-    return np.broadcast_to(np.float32(camera.position), directions.shape).copy(), directions
+    rays: Float = directions.reshape(-1, 3).astype(np.float32)
+    return _repeat(_vector(camera.position), len(rays)), rays
 
 
 def _shade(
@@ -156,7 +156,7 @@ def _shade(
     face = hit["primID"][found]
     u, v, depth = (hit[name][found].astype(np.float32) for name in ("u", "v", "tfar"))
     weights = np.stack([1 - u - v, u, v], axis=1)[:, :, None]
-    position = np.float32(camera.position) + directions * depth[:, None]
+    position = _vector(camera.position) + directions * depth[:, None]
     smooth = _unit((mesh.normals[face] * weights).sum(axis=1))
     view = -_unit(directions)
     # A mesh may be wound either way: turn normals to the viewer's side
@@ -169,13 +169,13 @@ def _shade(
     if mesh.albedo_map is not None:
         albedo = mesh.albedo_map.sample(uv, texels * mesh.albedo_map.width)
     else:
-        albedo = np.broadcast_to(np.float32(mesh.albedo), position.shape).copy()
+        albedo = _repeat(_vector(mesh.albedo), len(position))
 
     # Diffuse irradiance apart from the mirrored part
     open_sky = (occlusion[face][:, :, None] * weights).sum(axis=1)
     lifted = (position + smooth * np.float32(LIFT * mesh.head_height)).astype(np.float32)
-    irradiance = np.float32(rig.ambient) * open_sky * (0.75 + 0.25 * normal[:, 1:2])
-    mirrored = np.float32(rig.ambient) * open_sky * open_sky * REFLECTANCE
+    irradiance = _vector(rig.ambient) * open_sky * (0.75 + 0.25 * normal[:, 1:2])
+    mirrored = _vector(rig.ambient) * open_sky * open_sky * REFLECTANCE
     for light in rig.lights:
         towards = light.direction().astype(np.float32)
         facing = np.maximum(_dot(normal, towards), 0)
@@ -184,7 +184,7 @@ def _shade(
             lit = (facing > 0) & (_dot(smooth, towards) > -0.1)
             seen[:] = 0
             seen[lit] = _visible_share(caster, lifted[lit], light)
-        received = np.float32(light.irradiance) * (facing * seen)[:, None]
+        received = _vector(light.irradiance) * (facing * seen)[:, None]
         irradiance += received
         mirrored += received * _glint(normal, towards, view, light.radius)[:, None]
     return {
@@ -220,14 +220,14 @@ def _glint(normal: Float, towards: Float, view: Float, radius: float) -> Float:
     along = np.maximum(_dot(half_way, towards), 0.05)
     schlick = REFLECTANCE + (1 - REFLECTANCE) * (1 - along) ** 5
     spread = across * across * (a2 - 1) + 1
-    return schlick * a2 / (4 * along * along * spread * spread)
+    lobe: Float = schlick * a2 / (4 * along * along * spread * spread)
+    return lobe
 
 
 def _visible_share(caster: _Caster, origins: Float, light: Light) -> Float:
     """Share of the light's disc seen from each of (n, 3) points.
 
-    A ring of four rays first; only where they disagree, or one stands alone against the centre, the
-    whole pattern.
+    Four rays to the rim and one to the centre first; only where they disagree, the whole pattern.
     """
     pattern = _disc_pattern(light, SHADOW_RAYS)
     rim = _disc_points(light, np.array([[1, 0], [0, 1], [-1, 0], [0, -1], [0, 0]]) * 0.98)
@@ -246,9 +246,7 @@ def _visible_share(caster: _Caster, origins: Float, light: Light) -> Float:
 
 
 def _disc_pattern(light: Light, count: int) -> Float:
-    """(count, 3) directions over the disc in equal areas: Vogel's spiral, golden angle between
-    neighbours.
-    """
+    """(count, 3) directions, equal areas of the disc each: Vogel's spiral by the golden angle."""
     index = np.arange(count)
     angle = index * np.pi * (3 - np.sqrt(5))
     radius = np.sqrt((index + 0.5) / count)
@@ -265,9 +263,8 @@ def _disc_points(light: Light, points: npt.NDArray[np.float64]) -> Float:
 
 
 def _corner_occlusion(mesh: Mesh, caster: _Caster) -> Float:
-    """(faces, 3): share of the sky above each corner, weighted by the cosine; once per vertex and
-    normal.
-    """
+    """(faces, 3): share of the sky seen from each corner, weighted by the cosine."""
+    # Once per vertex and normal
     pairs = np.concatenate([mesh.corners, mesh.normals], axis=2).reshape(-1, 6)
     unique, back = np.unique(pairs, axis=0, return_inverse=True)
     position, normal = unique[:, :3], unique[:, 3:]
@@ -287,8 +284,13 @@ def _corner_occlusion(mesh: Mesh, caster: _Caster) -> Float:
     return share
 
 
-def _repeat(direction: Float, count: int) -> Float:
-    return np.ascontiguousarray(np.broadcast_to(direction, (count, 3)))
+def _vector(values: tuple[float, ...]) -> Float:
+    return np.array(values, dtype=np.float32)
+
+
+def _repeat(vector: Float, count: int) -> Float:
+    """(count, 3) contiguous rows, which Embree needs."""
+    return np.repeat(vector[None], count, axis=0)
 
 
 def _dot(a: Float, b: Float) -> Float:

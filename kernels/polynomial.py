@@ -17,9 +17,8 @@ _F = np.float32
 _LN2_HIGH = _F(float.fromhex("0x1.62ep-1"))
 _LN2_LOW = _F(float.fromhex("0x1.0bfbe8p-15"))
 _LOG2_E = _F(float.fromhex("0x1.715476p+0"))
-_ROUND_TO_INTEGER = _F(
-    3 << 22
-)  # added to a small number, it leaves the nearest integer in the low bits
+# Added to a small number, it leaves the nearest integer in the low bits.
+_ROUND_TO_INTEGER = _F(3 << 22)
 _SQRT_HALF_BITS = np.int32(0x3F3504F3)
 _TURN_TO_RADIANS = _F(float.fromhex("0x1.921fb6p-30"))
 _ONE = _F(1)

@@ -90,8 +90,8 @@ def _capture(
     wanted = (width or gbuffer.width, height or gbuffer.height)
     if wanted != (gbuffer.width, gbuffer.height):
         raise InputError(
-            f"{path}: size {wanted[0]}x{wanted[1]}: the captured G-buffer is {gbuffer.width}x{gbuffer.height}; "
-            "leave the size out"
+            f"{path}: size {wanted[0]}x{wanted[1]}: the captured G-buffer is "
+            f"{gbuffer.width}x{gbuffer.height}; leave the size out"
         )
     return gbuffer
 

@@ -211,12 +211,12 @@ def test_an_absent_level_is_an_absent_key(
 def test_run_takes_overrides_and_writes_json_and_csv(folder: Path, trace_file: Path) -> None:
     common = ["run", str(trace_file), *GPU, "--json"]
     assert run_command([*common, "real.json", "--csv", "by.csv"]) == 0
-    assert run_command([*common, "big.json", "--set", "l1.capacity=12MiB"]) == 0
-    real, big = (json.loads((folder / n).read_text()) for n in ("real.json", "big.json"))
-    assert big["l1"]["misses"] < real["l1"]["misses"]
+    assert run_command([*common, "small.json", "--set", "l1.capacity=6KiB"]) == 0
+    real, small = (json.loads((folder / n).read_text()) for n in ("real.json", "small.json"))
+    assert small["l1"]["misses"] > real["l1"]["misses"]
     by = pd.read_csv(folder / "by.csv")
     assert by[by["level"] == "l1"]["accesses"].sum() == real["l1"]["accesses"]
-    assert sorted(p.name for p in folder.iterdir()) == ["big.json", "by.csv", "real.json"]
+    assert sorted(p.name for p in folder.iterdir()) == ["by.csv", "real.json", "small.json"]
 
 
 def test_run_counts_a_lane_address_file(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -379,7 +379,12 @@ def test_an_interrupted_sweep_leaves_nothing_half_written(folder: Path, tmp_path
     assert code == 130, error
     assert error.strip().splitlines()[-1] == "cachesim: error: interrupted"
     assert "Traceback" not in error
-    assert list(folder.iterdir()) == []
+    # What was finished is kept, whole, under a name of its own.
+    assert {path.name for path in folder.iterdir()} <= {"s.partial.csv"}
+    for path in folder.iterdir():
+        kept = pd.read_csv(path)
+        assert 0 < len(kept) < 399
+        assert kept["l1.accesses"].notna().all()
 
 
 @pytest.mark.opencl

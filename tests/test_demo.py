@@ -1,6 +1,7 @@
 """The studies end to end at a tiny size, and the sentences under their tables."""
 
 import csv
+import json
 from pathlib import Path
 
 import pandas as pd
@@ -141,7 +142,9 @@ def test_a_recorded_file_counts_like_the_live_recording(tmp_path: Path) -> None:
     arguments = ["--scene", "ear", "--method", "adaptive", "--frames", "3", "--size", "96x54"]
     assert run_command(["record", *arguments, "-o", str(path)]) == 0
     live = record(load_scene("ear", 96, 54), Method(kind="adaptive"), num_frames=3)
-    assert simulate(open_trace(path), "rtx-2080-ti") == simulate(live, "rtx-2080-ti")
+    counted = [simulate(trace, "rtx-2080-ti") for trace in (open_trace(path), live)]
+    # JSON, as the file's manifest has lists where the live one has tuples.
+    assert len({json.dumps(report.to_json()) for report in counted}) == 1
 
 
 @pytest.mark.opencl

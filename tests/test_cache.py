@@ -1,0 +1,413 @@
+"""The cache against an obvious reference, bit for bit; its policies against closed forms; the set and
+partition hashes against the facts sheet's own words.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from cachesim import cache
+from cachesim.address import index_of, ipoly_columns, partition_of, set_hash, slice_and_line
+from cachesim.config import L2, CacheLevel
+from cachesim.stream import ATOMIC, GROUP_BITS, LOAD, STORE, Requests
+from tests.reference_cache import ReferenceCache
+
+POLICIES = ("lru", "fifo", "tree-plru", "random", "srrip")
+WRITE_POLICIES = (
+    "read-only",
+    "write-through",
+    "write-back",
+    "write-evict",
+    "local-write-back",
+)
+ALLOCATIONS = ("none", "write-allocate", "fetch-on-write", "lazy-fetch-on-read")
+COUNTERS = (
+    "requests",
+    "accesses",
+    "hits",
+    "line_misses",
+    "sector_misses",
+    "writes",
+    "write_misses",
+    "stores_down",
+    "write_fills",
+    "bypasses",
+    "bypassed_writes",
+    "writebacks",
+)
+NUM_GROUPS = 3
+
+
+def level_of(num_sets: int, ways: int, **fields: object) -> CacheLevel:
+    defaults = {
+        "line_bytes": 128,
+        "sector_bytes": 32,
+        "replacement": "lru",
+        "set_hash": "linear",
+        "write_policy": "read-only",
+        "write_allocate": "none",
+    }
+    fields = defaults | fields
+    return CacheLevel(capacity=num_sets * ways * fields["line_bytes"], ways=ways, **fields)
+
+
+def requests_of(
+    line: np.ndarray,
+    mask: np.ndarray | None = None,
+    operation: np.ndarray | int = LOAD,
+    group: np.ndarray | int = 0,
+    bytes_written: np.ndarray | None = None,
+    segments: np.ndarray | None = None,
+    instance: np.ndarray | None = None,
+) -> Requests:
+    """A batch as the engine makes it; each request may have its own row of `bytes_written`."""
+    n = len(line)
+    segments = np.array([0, n]) if segments is None else segments
+    meta = (np.broadcast_to(operation, n).astype(np.uint32) << np.uint32(GROUP_BITS)) | np.broadcast_to(
+        group, n
+    ).astype(np.uint32)
+    return Requests(
+        line=line.astype(np.uint64),
+        mask=np.ones(n, np.uint8) if mask is None else mask.astype(np.uint8),
+        meta=meta,
+        written=np.arange(n, dtype=np.int32),
+        bytes_written=np.zeros((n, 8), np.uint32) if bytes_written is None else bytes_written,
+        segments=segments.astype(np.int64),
+        instance=(np.zeros(len(segments) - 1) if instance is None else instance).astype(np.uint32),
+        order=np.arange(len(segments) - 1),
+    )
+
+
+@st.composite
+def cases(draw):
+    """A level, its instances and bypasses, and two batches of requests to it."""
+    policy = draw(st.sampled_from(POLICIES))
+    num_sets = draw(st.one_of(st.integers(1, 7), st.sampled_from([16, 33])))
+    ways = draw(st.one_of(st.integers(1, 8), st.integers(9, 64 if policy == "tree-plru" else 100)))
+    line_bytes, sector_bytes = draw(
+        st.sampled_from([(128, 32), (128, 128), (64, 64), (256, 32), (128, 16), (8, 1)])
+    )
+    level = level_of(
+        num_sets,
+        ways,
+        line_bytes=line_bytes,
+        sector_bytes=sector_bytes,
+        replacement=policy,
+        write_policy=draw(st.sampled_from(WRITE_POLICIES)),
+        write_allocate=draw(st.sampled_from(ALLOCATIONS)),
+    )
+    num_instances = draw(st.integers(1, 3))
+    bypass_loads = draw(st.sampled_from([False, False, False, True]))
+    bypass_stores = level.write_policy == "read-only" or draw(
+        st.sampled_from([False, False, False, True])
+    )
+    random = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    # From mostly hits to mostly misses; anywhere in the 64-bit range.
+    num_lines = max(1, int(num_sets * ways * draw(st.sampled_from([0.5, 1.1, 2, 6]))))
+    base = draw(st.sampled_from([0, 2**40 - 3, 2**64 - num_lines]))
+    pool = np.uint64(base) + np.arange(num_lines, dtype=np.uint64)
+    if draw(st.booleans()):
+        pool = random.integers(0, 2**64, num_lines, dtype=np.uint64)
+    store_rate = draw(st.sampled_from([0.0, 0.3, 0.8]))
+    batches = [
+        batch_of(random, pool, level, num_instances, draw(st.integers(0, 400)), store_rate)
+        for _ in range(2)
+    ]
+    return level, num_instances, bypass_loads, bypass_stores, batches
+
+
+def batch_of(random, pool, level, num_instances, n, store_rate):
+    sectors = level.sectors_per_line
+    every_byte = (1 << min(32, level.sector_bytes)) - 1
+    written = random.integers(1, every_byte, (n, 8), dtype=np.uint64, endpoint=True)
+    # Halves that add up, and whole sectors, are what real stores write.
+    shape = random.integers(0, 4, (n, 8))
+    low = max(1, every_byte & 0xFFFF)
+    written = np.choose(shape, [written, every_byte, low, max(1, every_byte ^ low)])
+    cuts = np.sort(random.integers(0, n + 1, random.integers(0, 6)))
+    segments = np.concatenate([[0], cuts, [n]])
+    rates = [1 - store_rate, 0.8 * store_rate, 0.2 * store_rate]
+    return requests_of(
+        random.choice(pool, n),
+        random.integers(1, 1 << sectors, n),
+        random.choice([LOAD, STORE, ATOMIC], n, p=rates),
+        random.integers(0, NUM_GROUPS, n),
+        written.astype(np.uint32),
+        segments,
+        random.integers(0, num_instances, len(segments) - 1),
+    )
+
+
+def sectors_in(mask: int) -> set[int]:
+    return {s for s in range(8) if mask >> s & 1}
+
+
+@settings(max_examples=150)
+@given(cases())
+def test_cache_equals_the_reference_bit_for_bit(case) -> None:
+    level, num_instances, bypass_loads, bypass_stores, batches = case
+    rules = cache.cache_rules(
+        level, num_instances, bypass_loads=bypass_loads, bypass_stores=bypass_stores
+    )
+    state = cache.empty_state(rules)
+    counters = np.zeros((NUM_GROUPS, cache.NUM_COUNTERS), np.int64)
+    reference = ReferenceCache(level, bypass_loads=bypass_loads, bypass_stores=bypass_stores)
+    for requests in batches:
+        # Any function of the line will do for a set.
+        sets = (requests.line % np.uint64(1009) % np.uint64(level.num_sets)).astype(np.uint32)
+        outcome = cache.empty_outcome(rules, len(sets))
+        cache.access(state, rules, requests, sets, counters, outcome)
+        compare_with_reference(reference, requests, sets, outcome)
+        for column, name in enumerate(COUNTERS):
+            expected = [reference.counters[group, name] for group in range(NUM_GROUPS)]
+            assert counters[:, column].tolist() == expected, name
+    dirty = Counter()
+    if rules.can_be_dirty:
+        for s in range(8):
+            held = (state.flags[cache.DIRTY :: 32] >> s) & 1 == 1
+            dirty.update(state.owner[held, s].tolist())
+    assert dirty == reference.dirty_sectors()
+
+
+def compare_with_reference(reference, requests, sets, outcome) -> None:
+    instances = np.repeat(requests.instance, np.diff(requests.segments))
+    for i in range(requests.num_requests):
+        operation, group = int(requests.meta[i] >> GROUP_BITS), int(requests.meta[i] & 0xFFFFFF)
+        expected = reference.access(
+            int(instances[i]),
+            int(sets[i]),
+            int(requests.line[i]),
+            sectors_in(int(requests.mask[i])),
+            operation,
+            group,
+            dict(enumerate(requests.bytes_written[requests.written[i]].tolist())),
+        )
+        assert sectors_in(int(outcome.down[i])) == expected.down
+        if operation != LOAD and len(outcome.fill):
+            assert sectors_in(int(outcome.fill[i])) == expected.fill
+        else:
+            assert not expected.fill
+        written_back = {}
+        if len(outcome.evicted_owner):
+            written_back = {
+                s: (int(outcome.evicted_owner[i, s]), int(outcome.evicted_bytes[i, s]))
+                for s in range(8)
+                if outcome.evicted_owner[i, s] >= 0
+            }
+        assert written_back == expected.written_back
+        if written_back:
+            assert int(outcome.evicted_line[i]) == expected.evicted
+
+
+def line_misses(level: CacheLevel, lines: np.ndarray) -> int:
+    """Misses of whole-line loads, all in set 0 of one instance."""
+    rules = cache.cache_rules(level, 1, bypass_loads=False, bypass_stores=True)
+    counters = np.zeros((1, cache.NUM_COUNTERS), np.int64)
+    requests = requests_of(lines)
+    sets = np.zeros(len(lines), np.uint32)
+    cache.access(
+        cache.empty_state(rules), rules, requests, sets, counters, cache.empty_outcome(rules, len(lines))
+    )
+    return int(counters[0, cache.LINE_MISSES])
+
+
+@pytest.mark.parametrize("ways", [1, 4, 12, 96])
+def test_ways_plus_one_lines_in_a_circle_all_miss_under_lru_and_fifo(ways: int) -> None:
+    circle = np.tile(np.arange(ways + 1), 5)
+    for policy in ("lru", "fifo"):
+        assert line_misses(level_of(1, ways, replacement=policy), circle) == len(circle)
+
+
+@pytest.mark.parametrize("policy", POLICIES)
+@pytest.mark.parametrize("ways", [1, 3, 16, 48])
+def test_a_working_set_that_fits_has_only_compulsory_misses(policy: str, ways: int) -> None:
+    lines = np.random.default_rng(1).integers(0, ways, 500)
+    level = level_of(1, ways, replacement=policy)
+    assert line_misses(level, lines) == len(np.unique(lines))
+
+
+@pytest.mark.parametrize(
+    ("policy", "stream", "last_hits"),
+    [
+        # Filled 0 1 2 3, then 0 used: who is gone when 4 comes?
+        ("lru", [0, 1, 2, 3, 0, 4, 1], False),
+        ("lru", [0, 1, 2, 3, 0, 4, 0], True),
+        ("fifo", [0, 1, 2, 3, 0, 4, 0], False),
+        # The root points away from 0's half; in the other half, away from 3.
+        ("tree-plru", [0, 1, 2, 3, 0, 4, 2], False),
+        ("tree-plru", [0, 1, 2, 3, 0, 4, 1], True),
+        # 0 was used again, so the first of those that were not goes.
+        ("srrip", [0, 1, 2, 3, 0, 4, 1], False),
+        ("srrip", [0, 1, 2, 3, 0, 4, 0], True),
+    ],
+)
+def test_the_victim_is_the_policys(policy: str, stream: list[int], last_hits: bool) -> None:
+    level = level_of(1, 4, replacement=policy)
+    before = line_misses(level, np.array(stream[:-1]))
+    assert line_misses(level, np.array(stream)) - before == (not last_hits)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_sets_are_independent(seed: int) -> None:
+    random = np.random.default_rng(seed)
+    lines = random.integers(0, 60, 600)
+    sets = lines % 3
+    level = level_of(3, 5, replacement="srrip")
+    rules = cache.cache_rules(level, 1, bypass_loads=False, bypass_stores=True)
+
+    def misses(order: np.ndarray) -> int:
+        counters = np.zeros((1, cache.NUM_COUNTERS), np.int64)
+        outcome = cache.empty_outcome(rules, len(order))
+        batch = requests_of(lines[order])
+        where = sets[order].astype(np.uint32)
+        cache.access(cache.empty_state(rules), rules, batch, where, counters, outcome)
+        return int(counters[0, cache.LINE_MISSES])
+
+    assert misses(np.argsort(sets, kind="stable")) == misses(np.arange(600))
+
+
+def test_reset_forgets_everything() -> None:
+    level = level_of(4, 3, replacement="lru", write_policy="write-back", write_allocate="fetch-on-write")
+    rules = cache.cache_rules(level, 2, bypass_loads=False, bypass_stores=False)
+    lines = np.random.default_rng(2).integers(0, 40, 300)
+    batch = requests_of(lines, operation=np.arange(300) % 2)
+    sets = (lines % 4).astype(np.uint32)
+    runs = []
+    state = cache.empty_state(rules)
+    for _ in range(2):
+        counters = np.zeros((1, cache.NUM_COUNTERS), np.int64)
+        cache.access(state, rules, batch, sets, counters, cache.empty_outcome(rules, 300))
+        runs.append(counters)
+        cache.reset(state, rules)
+    np.testing.assert_array_equal(*runs)
+
+
+def divide(number: int, polynomial: int) -> int:
+    """The remainder of a long division over GF(2)."""
+    degree = polynomial.bit_length() - 1
+    for bit in range(number.bit_length() - 1, degree - 1, -1):
+        if number >> bit & 1:
+            number ^= polynomial << (bit - degree)
+    return number
+
+
+NUMBERS = st.integers(0, 2**57 - 1) | st.integers(0, 4096)
+
+
+def set_index(level: CacheLevel, number: int) -> int:
+    hashed = set_hash(level)
+    return int(index_of(np.uint64(number), hashed.kind, hashed.size, hashed.table))
+
+
+@settings(max_examples=100)
+@given(NUMBERS, st.sampled_from([(16, 0b10011, 16), (32, 0b100101, 19), (64, 0b1000011, 24)]))
+def test_ipoly_is_the_remainder_of_a_polynomial_division(number: int, case) -> None:
+    """Facts sheet 3.2: block number mod P(x), bits up to 16, 19, 24."""
+    num_sets, polynomial, last_bit = case
+    expected = divide(number & ((2 << last_bit) - 1), polynomial)
+    assert set_index(level_of(num_sets, 2, set_hash="ipoly"), number) == expected
+
+
+@settings(max_examples=100)
+@given(NUMBERS, st.sampled_from([32, 64]))
+def test_fermi_is_the_facts_sheets_list_of_bits(number: int, num_sets: int) -> None:
+    """Facts sheet 3.2, in address bits: low5 = a[11:7] XOR {13, 14, 15, 17, 19}; 64 sets append a12."""
+    address = number << 7
+    bit = lambda k: address >> k & 1  # noqa: E731
+    pairs = ((7, 13), (8, 14), (9, 15), (10, 17), (11, 19))
+    expected = sum((bit(low) ^ bit(high)) << k for k, (low, high) in enumerate(pairs))
+    if num_sets == 64:
+        expected += bit(12) << 5
+    assert set_index(level_of(num_sets, 2, set_hash="fermi"), number) == expected
+
+
+@settings(max_examples=60)
+@given(NUMBERS, st.integers(1, 200), st.sampled_from([1, 2, 8, 64, 1024]))
+def test_linear_and_xor_sets(number: int, num_sets: int, power: int) -> None:
+    assert set_index(level_of(num_sets, 2), number) == number % num_sets
+    folded = (number % power) ^ (number // power % power)
+    assert set_index(level_of(power, 2, set_hash="xor"), number) == folded
+
+
+def sliced(channels: int, per_channel: int, interleave: int, partition_hash: str) -> L2:
+    return L2(
+        capacity=channels * per_channel * 16 * 128,
+        line_bytes=128,
+        sector_bytes=32,
+        ways=4,
+        replacement="lru",
+        set_hash="linear",
+        write_policy="write-back",
+        write_allocate="lazy-fetch-on-read",
+        num_channels=channels,
+        slices_per_channel=per_channel,
+        channel_interleave=interleave,
+        partition_hash=partition_hash,
+    )
+
+
+def slice_of(level: L2, address: int) -> tuple[int, int]:
+    p = partition_of(level)
+    u = np.uint64
+    where, line = slice_and_line(
+        u(address),
+        u(p.num_channels),
+        u(p.slices_per_channel),
+        u(p.run_shift),
+        p.hash.kind,
+        p.hash.size,
+        p.hash.table,
+        p.xor,
+        u(7),
+    )
+    return int(where), int(line)
+
+
+@settings(max_examples=100)
+@given(st.integers(0, 2**64 - 1))
+def test_twelve_channels_of_two_slices_as_the_facts_sheet_decodes_them(address: int) -> None:
+    """Facts sheet 3.4: chip = (a >> 8) mod 12; rest = (a >> 8) div 12, then a[7:0]; bank's low bit 7."""
+    chip, rest = (address >> 8) % 12, ((address >> 8) // 12) << 8 | (address & 255)
+    where, line = slice_of(sliced(12, 2, 256, "linear"), address)
+    assert where == chip * 2 + (rest >> 7 & 1)
+    # What is left of the address without channel and slice bits.
+    assert line == rest >> 8
+
+
+@settings(max_examples=60)
+@given(st.integers(0, 2**64 - 1), st.sampled_from([(16, 1, 256), (8, 2, 1024), (5, 4, 2048)]))
+def test_plain_and_xor_interleave_keep_every_address_apart(address: int, shape) -> None:
+    channels, per_channel, interleave = shape
+    level = sliced(channels, per_channel, interleave, "linear")
+    where, line = slice_of(level, address)
+    run = interleave // per_channel
+    assert where == address // interleave % channels * per_channel + address % interleave // run
+    assert line == address // (interleave * channels) * (run // 128) + address % run // 128
+    if channels & (channels - 1) == 0:
+        row = address // (interleave * channels)
+        where, same = slice_of(sliced(channels, per_channel, interleave, "xor"), address)
+        channel = (address // interleave % channels) ^ (row % channels)
+        assert (where, same) == (channel * per_channel + address % interleave // run, line)
+
+
+@settings(max_examples=60)
+@given(st.integers(0, 2**40 - 1))
+def test_ipoly_partition_hashes_over_the_next_power_of_two(address: int) -> None:
+    """Facts sheet 3.4, mode 2: 12 channels of 2 slices hash over 16 x 2 entries, then modulo 24."""
+    run = address >> 7
+    expected = divide(run & ((1 << 20) - 1), 0b100101) % 24
+    assert slice_of(sliced(12, 2, 256, "ipoly"), address)[0] == expected
+
+
+@pytest.mark.parametrize("degree", range(1, 9))
+def test_every_ipoly_polynomial_reaches_every_value(degree: int) -> None:
+    """The columns span the whole space, so that no slice is left out."""
+    reached = {0}
+    for column in ipoly_columns(degree):
+        reached |= {value ^ column for value in reached}
+    assert reached == set(range(1 << degree))
