@@ -1,7 +1,7 @@
 """The cache: a batch of requests in, hits and misses counted, what goes to the next level out.
 
-All instances of a level (units, arrays or slices) live in one set of flat arrays. A tag is found through a chained hash table, so
-that a set of 96 ways costs what one of 4 does; replacement is `cachesim.policies`.
+All instances of a level (units, arrays or slices) live in one set of flat arrays. `cachesim.lookup` finds lines in them,
+`cachesim.policies` chooses victims, `cachesim.access` holds the loops.
 """
 
 from __future__ import annotations
@@ -10,43 +10,39 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
 from cachesim import policies
+from cachesim.access import access_hashed, access_small
 from cachesim.config import CacheLevel
-from cachesim.stream import ATOMIC, GROUP_BITS, GROUP_MASK, LOAD, STORE, Outcome, Requests
-
-
-U64, U32, U8 = np.uint64, np.uint32, np.uint8
-
-# Places in the views of a line, beside those of `policies` (`CacheState`).
-CHAIN = U64(2)
-USED, VALID, PARTIAL, DIRTY = U64(20), U64(21), U64(22), U64(23)
-
-NO_LINE = np.uint32(0xFFFFFFFF)
-#: Of the hash of a line number to its bucket (Fibonacci hashing).
-_MULTIPLIER = np.uint64(0x9E3779B97F4A7C15)
-
-# Columns of the counters: all in the level's sectors, except REQUESTS.
-(
-    REQUESTS,
+from cachesim.counts import (
     ACCESSES,
+    BYPASSED_WRITES,
+    BYPASSES,
+    DIRTY,
+    HIT_BACK,
+    HIT_EVICT,
+    HIT_THROUGH,
     HITS,
     LINE_MISSES,
+    MISS_ALLOCATE,
+    MISS_FETCH,
+    MISS_LAZY,
+    MISS_NONE,
+    NUM_COUNTERS,
+    PARTIAL,
+    REQUESTS,
     SECTOR_MISSES,
-    WRITES,
-    WRITE_MISSES,
     STORES_DOWN,
+    USED,
+    VALID,
     WRITE_FILLS,
-    BYPASSES,
-    BYPASSED_WRITES,
+    WRITE_MISSES,
     WRITEBACKS,
-) = range(12)
-NUM_COUNTERS = 12
+    WRITES,
+)
+from cachesim.lookup import FIRST_RECENCY, NO_LINE, NO_TAG, SMALL_WAYS
+from cachesim.stream import Outcome, Requests
 
-# What a store does on a present sector, and on an absent one (facts sheet 3.2, `wr` and `wralloc`).
-HIT_THROUGH, HIT_BACK, HIT_EVICT = range(3)
-MISS_NONE, MISS_ALLOCATE, MISS_FETCH, MISS_LAZY = range(4)
 _ON_HIT = {
     "read-only": HIT_THROUGH,
     "write-through": HIT_THROUGH,
@@ -62,35 +58,37 @@ _ON_MISS = {
     "lazy-fetch-on-read": MISS_LAZY,
 }
 
-POPCOUNT = np.array([bin(m).count("1") for m in range(256)], np.int64)
-
 
 class CacheState(NamedTuple):
     """The arrays of all instances of a level. L = lines in all, S = sets in all, B = hash buckets in all.
 
-    A line is 32 bytes, half a host cache line, so that what a miss needs of its victim comes with one fetch. Three views of it:
-    tags: (4 L,) uint64, 4 l is the line number that line l holds. links: (8 L,) uint32, 8 l + `CHAIN` is the next line of its hash
-        chain, 8 l + `NEWER` and `OLDER` its set's ring (`policies`). flags: (32 L,) uint8, 32 l + `USED` holds a tag, `VALID`
-        readable sectors, `PARTIAL` sectors written in part and not readable, `DIRTY` sectors to write back, `RRPV` as SRRIP has it.
-    (Not records: numba counts references to an array for every record it takes from it, which costs twice the cache.)
-    newest: (S,) uint32 a set's most recent line. fills: (S,) uint64 tags it was given. tree: (S,) uint64 tree-PLRU's bits.
-    bucket: (B,) uint32 first line of a chain, `NO_LINE` = empty.
-    bytes_held: (L, 8) uint32 bytes of each partial sector; owner: (L, 8) int32 group that dirtied a sector.
+    flags: (4 L,) uint8, 4 l + `USED`, `VALID`, `PARTIAL`, `DIRTY`. bytes_held: (L, 8) uint32 bytes of each partial sector; owner:
+        (L, 8) int32 group that dirtied a sector.
+    Hashed: 24 bytes per line, in two views, so that what a miss needs of its victim comes with one fetch. tags: (3 L,) uint64,
+        3 l is the line number that line l holds. links: (6 L,) uint32, 6 l + `lookup.CHAIN` is the next line of its hash chain,
+        6 l + `policies.NEWER` and `OLDER` its set's ring. bucket: (B,) uint32 first line of a chain, `NO_LINE` = empty. newest:
+        (S,) uint32 a set's most recent line. fills: (S,) uint64 tags it was given. tree: (S,) uint64 tree-PLRU's bits. rrpv: (L,)
+        uint8 SRRIP's values. Empty where sets are small.
+    Small sets: every set has room for 16 lines. small_tags: (16 S,) uint32 line number less the first. recency: (S,) uint64, its
+        ways from the newest, lowest 4 bits, up. Empty where hashed.
     """
 
+    flags: npt.NDArray[np.uint8]
+    bytes_held: npt.NDArray[np.uint32]
+    owner: npt.NDArray[np.int32]
     tags: npt.NDArray[np.uint64]
     links: npt.NDArray[np.uint32]
-    flags: npt.NDArray[np.uint8]
+    bucket: npt.NDArray[np.uint32]
     newest: npt.NDArray[np.uint32]
     fills: npt.NDArray[np.uint64]
     tree: npt.NDArray[np.uint64]
-    bucket: npt.NDArray[np.uint32]
-    bytes_held: npt.NDArray[np.uint32]
-    owner: npt.NDArray[np.int32]
+    rrpv: npt.NDArray[np.uint8]
+    small_tags: npt.NDArray[np.uint32]
+    recency: npt.NDArray[np.uint64]
 
 
 class CacheRules(NamedTuple):
-    """The scalars of a level that its loop needs."""
+    """The scalars of a level that its loops need. small: whether it uses small sets, with line numbers from `first_line` up."""
 
     num_instances: int
     num_sets: int
@@ -103,13 +101,26 @@ class CacheRules(NamedTuple):
     can_be_dirty: int
     bypass_loads: int
     bypass_stores: int
+    small: int
+    first_line: np.uint64
 
 
 def cache_rules(
-    level: CacheLevel, num_instances: int, *, bypass_loads: bool, bypass_stores: bool
+    level: CacheLevel,
+    num_instances: int,
+    *,
+    bypass_loads: bool,
+    bypass_stores: bool,
+    first_line: int | None = None,
 ) -> CacheRules:
-    """The rules of `num_instances` caches like `level`."""
+    """The rules of `num_instances` caches like `level`.
+
+    first_line: given where all line numbers are known to lie in [first_line, first_line + 2^32 - 2]; lets sets be small.
+    """
     on_hit = _ON_HIT[level.write_policy]
+    small = (
+        first_line is not None and level.ways <= SMALL_WAYS and level.replacement in ("lru", "fifo")
+    )
     return CacheRules(
         num_instances=num_instances,
         num_sets=level.num_sets,
@@ -119,30 +130,37 @@ def cache_rules(
         all_bytes=(1 << min(32, level.sector_bytes)) - 1,
         on_hit=on_hit,
         on_miss=_ON_MISS[level.write_allocate],
-        can_be_dirty=int(on_hit == HIT_BACK),
+        can_be_dirty=int(on_hit == HIT_BACK and not bypass_stores),
         bypass_loads=int(bypass_loads),
         bypass_stores=int(bypass_stores),
+        small=int(small),
+        first_line=np.uint64(first_line or 0),
     )
 
 
 def empty_state(rules: CacheRules) -> CacheState:
     """Caches with nothing in them."""
     sets = rules.num_instances * rules.num_sets
-    lines = sets * rules.ways
+    lines = sets * (SMALL_WAYS if rules.small else rules.ways)
+    hashed_lines, hashed_sets = (0, 0) if rules.small else (lines, sets)
+    # Eight buckets per line: a chain that is nearly always empty or of one line is a branch that the host predicts.
     per_instance = rules.num_sets * rules.ways
     buckets = 1 << max(4, (8 * per_instance - 1).bit_length())
     stores = 0 if rules.bypass_stores else lines
-    memory = np.zeros(4 * lines, np.uint64)
+    memory = np.zeros(3 * hashed_lines, np.uint64)
     state = CacheState(
-        tags=memory,
-        links=memory.view(np.uint32),
-        flags=memory.view(np.uint8),
-        newest=np.zeros(sets, np.uint32),
-        fills=np.zeros(sets, np.uint64),
-        tree=np.zeros(sets, np.uint64),
-        bucket=np.empty(rules.num_instances * buckets, np.uint32),
+        flags=np.zeros(4 * lines, np.uint8),
         bytes_held=np.zeros((stores, 8), np.uint32),
         owner=np.zeros((stores, 8), np.int32),
+        tags=memory,
+        links=memory.view(np.uint32),
+        bucket=np.empty(0 if rules.small else rules.num_instances * buckets, np.uint32),
+        newest=np.zeros(hashed_sets, np.uint32),
+        fills=np.zeros(hashed_sets, np.uint64),
+        tree=np.zeros(hashed_sets, np.uint64),
+        rrpv=np.zeros(hashed_lines, np.uint8),
+        small_tags=np.empty(lines - hashed_lines, np.uint32),
+        recency=np.empty(sets - hashed_sets, np.uint64),
     )
     reset(state, rules)
     return state
@@ -150,14 +168,25 @@ def empty_state(rules: CacheRules) -> CacheState:
 
 def reset(state: CacheState, rules: CacheRules) -> None:
     """Forget every line; nothing is written back."""
+    state.flags[:] = 0
+    state.small_tags[:] = NO_TAG
+    state.recency[:] = FIRST_RECENCY
     state.bucket[:] = NO_LINE
     state.tags[:] = 0
     state.fills[:] = 0
     state.tree[:] = 0
-    lines = np.arange(len(state.tags) // 4, dtype=np.uint32).reshape(-1, rules.ways)
+    state.rrpv[:] = 0
+    lines = np.arange(len(state.tags) // 3, dtype=np.uint32).reshape(-1, rules.ways)
     state.newest[:] = lines[:, 0]
-    state.links[policies.NEWER :: 8] = np.roll(lines, 1, axis=1).ravel()
-    state.links[policies.OLDER :: 8] = np.roll(lines, -1, axis=1).ravel()
+    state.links[policies.NEWER :: 6] = np.roll(lines, 1, axis=1).ravel()
+    state.links[policies.OLDER :: 6] = np.roll(lines, -1, axis=1).ravel()
+
+
+def line_numbers(state: CacheState, rules: CacheRules) -> npt.NDArray[np.uint64]:
+    """(L,) uint64: the line number that each line holds; undefined where it holds none."""
+    if rules.small:
+        return state.small_tags.astype(np.uint64) + rules.first_line
+    return state.tags[::3]
 
 
 def empty_outcome(rules: CacheRules, num_requests: int) -> Outcome:
@@ -172,319 +201,49 @@ def empty_outcome(rules: CacheRules, num_requests: int) -> Outcome:
     )
 
 
-@njit(cache=True, nogil=True, _nrt=False)
-def _evict(  # type: ignore[no-untyped-def]
-    tags,
-    flags,
-    bytes_held,
-    owner,
-    line,
-    sectors_per_line,
-    all_bytes,
-    i,
-    counters,
-    evicted_line,
-    evicted_owner,
-    evicted_bytes,
-):
-    """Count and report the write-back of a dirty line; a write-back belongs to the group that dirtied the sector."""
-    evicted_line[i] = tags[line * U64(4)]
-    dirty = flags[line * U64(32) + DIRTY]
-    for s in range(sectors_per_line):
-        if (dirty >> U8(s)) & U8(1):
-            counters[owner[line, s], WRITEBACKS] += 1
-            evicted_owner[i, s] = owner[line, s] + 1
-            full = (flags[line * U64(32) + VALID] >> U8(s)) & U8(1)
-            evicted_bytes[i, s] = all_bytes if full else bytes_held[line, s]
-    flags[line * U64(32) + DIRTY] = 0
-
-
-@njit(cache=True, nogil=True, _nrt=False)
-def _store(state, rules, line, mask, group, operation, written, bytes_written):  # type: ignore[no-untyped-def]
-    """Put a store's or atomic's sectors into a present line. Returns (sectors passed down, sectors to fetch)."""
-    flags = state.flags
-    down, fill = U8(0), U8(0)
-    for s in range(rules.sectors_per_line):
-        bit = U8(1) << U8(s)
-        if not mask & bit:
-            continue
-        if rules.on_hit == HIT_EVICT and operation == STORE:
-            flags[line * U64(32) + VALID] &= ~bit
-            flags[line * U64(32) + PARTIAL] &= ~bit
-            down |= bit
-            continue
-        readable = flags[line * U64(32) + VALID] & bit
-        held = state.bytes_held[line, s] if flags[line * U64(32) + PARTIAL] & bit else U32(0)
-        present = readable or held
-        if not present and rules.on_miss == MISS_NONE:
-            down |= bit
-            continue
-        covered = held | (
-            U32(rules.all_bytes) if operation == ATOMIC else bytes_written[written, s]
-        )
-        complete = covered == U32(rules.all_bytes)
-        if not readable and (
-            operation == ATOMIC
-            or (rules.on_miss == MISS_ALLOCATE and not present)
-            or (rules.on_miss != MISS_LAZY and not complete)
-        ):
-            fill |= bit
-            readable = bit
-        if readable or complete:
-            flags[line * U64(32) + VALID] |= bit
-            flags[line * U64(32) + PARTIAL] &= ~bit
-        else:
-            flags[line * U64(32) + PARTIAL] |= bit
-            state.bytes_held[line, s] = covered
-        if rules.on_hit == HIT_BACK and (present or rules.on_miss != MISS_ALLOCATE):
-            flags[line * U64(32) + DIRTY] |= bit
-            state.owner[line, s] = group
-        else:
-            down |= bit
-    return down, fill
-
-
-@njit(cache=True, nogil=True, _nrt=False, inline="always")
-def _find(tags, links, buckets, bucket, number):  # type: ignore[no-untyped-def]
-    """The line that holds a tag, or `NO_LINE`."""
-    line = buckets[bucket]
-    while line != NO_LINE and tags[line * U64(4)] != number:
-        line = links[line * U64(8) + CHAIN]
-    return line
-
-
-@njit(cache=True, nogil=True, _nrt=False, inline="always")
-def _take(  # type: ignore[no-untyped-def]
-    tags,
-    links,
-    flags,
-    newest,
-    fills,
-    tree,
-    buckets,
-    policy,
-    ways,
-    bucket,
-    first_bucket,
-    bucket_shift,
-    cache_set,
-):
-    """Give a line of the set to a new tag. What its last tag left in it is still there but for the tag: see `_clear`."""
-    line = policies.victim(policy, cache_set, ways, links, flags, newest, fills, tree)
-    if flags[line * U64(32) + USED]:
-        old = first_bucket + ((tags[line * U64(4)] * _MULTIPLIER) >> bucket_shift)
-        other = buckets[old]
-        if other == line:
-            buckets[old] = links[line * U64(8) + CHAIN]
-        else:
-            while links[other * U64(8) + CHAIN] != line:
-                other = links[other * U64(8) + CHAIN]
-            links[other * U64(8) + CHAIN] = links[line * U64(8) + CHAIN]
-    flags[line * U64(32) + USED] = 1
-    links[line * U64(8) + CHAIN] = buckets[bucket]
-    buckets[bucket] = line
-    return line
-
-
-@njit(cache=True, nogil=True, _nrt=False)
-def _other_request(  # type: ignore[no-untyped-def]
-    state, rules, requests, i, bucket, first_bucket, bucket_shift, cache_set, counters, outcome
-):
-    """A store, an atomic, or a load that bypasses."""
-    tags, links, flags = state.tags, state.links, state.flags
-    number, mask = requests.line[i], requests.mask[i]
-    operation = requests.meta[i] >> U32(GROUP_BITS)
-    group = U64(requests.meta[i] & U32(GROUP_MASK))
-    count = POPCOUNT[mask]
-    outcome.down[i] = mask
-    if len(outcome.fill):
-        outcome.fill[i] = 0
-    bypasses = rules.bypass_loads if operation == LOAD else rules.bypass_stores
-    if bypasses or (operation == ATOMIC and rules.on_hit != HIT_BACK):
-        counters[group, BYPASSES] += count
-        if operation != LOAD:
-            counters[group, BYPASSED_WRITES] += count
-        return
-    counters[group, REQUESTS] += 1
-    counters[group, ACCESSES] += count
-    counters[group, WRITES] += count
-    line = _find(tags, links, state.bucket, bucket, number)
-    if line != NO_LINE:
-        # A write hits a sector that was written in part; an atomic reads it first.
-        present = flags[line * U64(32) + VALID]
-        if operation == STORE:
-            present |= flags[line * U64(32) + PARTIAL]
-        hits = POPCOUNT[present & mask]
-        counters[group, HITS] += hits
-        counters[group, SECTOR_MISSES] += count - hits
-        counters[group, WRITE_MISSES] += count - hits
-        policies.touch(
-            rules.policy, line, cache_set, U64(rules.ways), links, flags, state.newest, state.tree
-        )
-    else:
-        counters[group, LINE_MISSES] += count
-        counters[group, WRITE_MISSES] += count
-        if rules.on_miss == MISS_NONE:
-            counters[group, STORES_DOWN] += count
-            return
-        line = _take(
-            tags,
-            links,
-            flags,
-            state.newest,
-            state.fills,
-            state.tree,
-            state.bucket,
-            rules.policy,
-            U64(rules.ways),
-            bucket,
-            first_bucket,
-            bucket_shift,
-            cache_set,
-        )
-        if rules.can_be_dirty and flags[line * U64(32) + DIRTY]:
-            _evict(
-                tags,
-                flags,
-                state.bytes_held,
-                state.owner,
-                line,
-                rules.sectors_per_line,
-                rules.all_bytes,
-                i,
-                counters,
-                outcome.evicted_line,
-                outcome.evicted_owner,
-                outcome.evicted_bytes,
-            )
-        tags[line * U64(4)] = number
-        flags[line * U64(32) + VALID] = 0
-        flags[line * U64(32) + PARTIAL] = 0
-    down, fill = _store(
-        state, rules, line, mask, group, operation, requests.written[i], requests.bytes_written
-    )
-    counters[group, STORES_DOWN] += POPCOUNT[down]
-    counters[group, WRITE_FILLS] += POPCOUNT[fill]
-    outcome.down[i] = down
-    outcome.fill[i] = fill
-
-
-@njit(cache=True, nogil=True, _nrt=False)
-def access(state, rules, requests, sets, counters, outcome):  # type: ignore[no-untyped-def]
+def access(
+    state: CacheState,
+    rules: CacheRules,
+    requests: Requests,
+    sets: npt.NDArray[np.uint32],
+    counters: npt.NDArray[np.int64],
+    outcome: Outcome,
+) -> None:
     """Send requests to their cache instances, segment by segment.
 
-    requests: `Requests`, segments of one instance in issue order. sets: (n,) uint32, set of each request in its instance.
-    counters: (num_groups, NUM_COUNTERS) int64, added to. outcome: `Outcome`, zeroed by the caller where it can be dirty.
+    requests: segments of one instance in issue order. sets: (n,) uint32, set of each request in its instance.
+    counters: (num_groups, NUM_COUNTERS) int64, added to. outcome: room for every request, filled in.
     """
-    # Arrays of a tuple are counted references; in local names the loop takes none.
-    tags, links, flags, newest, fills, tree, buckets, bytes_held, owner = state
-    down, _, evicted_line, evicted_owner, evicted_bytes = outcome
-    all_lines, all_masks, all_meta = requests.line, requests.mask, requests.meta
-    sectors_per_line, all_bytes = rules.sectors_per_line, rules.all_bytes
-    policy, can_be_dirty, bypass_loads = rules.policy, rules.can_be_dirty, rules.bypass_loads
-    ways = U64(rules.ways)
-    num_buckets = U64(len(buckets) // rules.num_instances)
-    bucket_shift = U64(64)
-    size = num_buckets
-    while size > U64(1):
-        size >>= U64(1)
-        bucket_shift -= U64(1)
-    for segment in range(len(requests.instance)):
-        instance = U64(requests.instance[segment])
-        first_bucket = instance * num_buckets
-        first_set = instance * U64(rules.num_sets)
-        begin, end = U64(requests.segments[segment]), U64(requests.segments[segment + 1])
-        # Counts of a run of loads of one group stay in registers.
-        run = U32(0)
-        looked_up, asked, hits, line_misses = 0, 0, 0, 0
-        for i in range(begin, end):
-            number, mask, meta = all_lines[i], all_masks[i], all_meta[i]
-            if meta != run:
-                _add_loads(counters, run, looked_up, asked, hits, line_misses)
-                run = meta
-                looked_up, asked, hits, line_misses = 0, 0, 0, 0
-            bucket = first_bucket + ((number * _MULTIPLIER) >> bucket_shift)
-            cache_set = first_set + U64(sets[i])
-            if bypass_loads or meta >> U32(GROUP_BITS) != U32(LOAD):
-                _other_request(
-                    state,
-                    rules,
-                    requests,
-                    i,
-                    bucket,
-                    first_bucket,
-                    bucket_shift,
-                    cache_set,
-                    counters,
-                    outcome,
-                )
-                continue
-            count = POPCOUNT[mask]
-            looked_up += 1
-            asked += count
-            line = _find(tags, links, buckets, bucket, number)
-            if line != NO_LINE:
-                policies.touch(policy, line, cache_set, ways, links, flags, newest, tree)
-                valid = flags[line * U64(32) + VALID]
-                hits += POPCOUNT[valid & mask]
-                down[i] = mask & ~valid
-                flags[line * U64(32) + VALID] = valid | mask
-                flags[line * U64(32) + PARTIAL] &= ~mask
-            else:
-                line = _take(
-                    tags,
-                    links,
-                    flags,
-                    newest,
-                    fills,
-                    tree,
-                    buckets,
-                    policy,
-                    ways,
-                    bucket,
-                    first_bucket,
-                    bucket_shift,
-                    cache_set,
-                )
-                if can_be_dirty and flags[line * U64(32) + DIRTY]:
-                    _evict(
-                        tags,
-                        flags,
-                        bytes_held,
-                        owner,
-                        line,
-                        sectors_per_line,
-                        all_bytes,
-                        i,
-                        counters,
-                        evicted_line,
-                        evicted_owner,
-                        evicted_bytes,
-                    )
-                tags[line * U64(4)] = number
-                flags[line * U64(32) + VALID] = mask
-                flags[line * U64(32) + PARTIAL] = 0
-                line_misses += count
-                down[i] = mask
-        _add_loads(counters, run, looked_up, asked, hits, line_misses)
-
-
-@njit(cache=True, nogil=True, _nrt=False, inline="always")
-def _add_loads(counters, meta, looked_up, asked, hits, line_misses):  # type: ignore[no-untyped-def]
-    group = U64(meta & U32(GROUP_MASK))
-    counters[group, REQUESTS] += looked_up
-    counters[group, ACCESSES] += asked
-    counters[group, HITS] += hits
-    counters[group, LINE_MISSES] += line_misses
-    counters[group, SECTOR_MISSES] += asked - hits - line_misses
+    if rules.small:
+        access_small(state, rules, requests, sets, counters, outcome, np.uint64(SMALL_WAYS))
+    else:
+        access_hashed(state, rules, requests, sets, counters, outcome)
 
 
 __all__ = [
+    "ACCESSES",
+    "BYPASSED_WRITES",
+    "BYPASSES",
+    "DIRTY",
+    "HITS",
+    "LINE_MISSES",
+    "NUM_COUNTERS",
+    "PARTIAL",
+    "REQUESTS",
+    "SECTOR_MISSES",
+    "STORES_DOWN",
+    "USED",
+    "VALID",
+    "WRITEBACKS",
+    "WRITES",
+    "WRITE_FILLS",
+    "WRITE_MISSES",
     "CacheRules",
     "CacheState",
     "access",
     "cache_rules",
     "empty_outcome",
     "empty_state",
+    "line_numbers",
     "reset",
 ]

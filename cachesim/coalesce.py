@@ -259,7 +259,17 @@ def new_scratch(warp_size: int, key_dtype: npt.DTypeLike) -> Scratch:
 
 @njit(cache=True, nogil=True, _nrt=False)
 def coalesce(  # type: ignore[no-untyped-def]
-    slots, lanes, instruction, program, place, sector_shift, line_shift, first, scratch, requests, lane_fetches
+    slots,
+    lanes,
+    instruction,
+    program,
+    place,
+    sector_shift,
+    line_shift,
+    first,
+    scratch,
+    requests,
+    lane_fetches,
 ):
     """Coalesce the rows at `slots` of the store, in that order, into `requests`, a segment each.
 
@@ -280,7 +290,16 @@ def coalesce(  # type: ignore[no-untyped-def]
         last_mip = 0
         if texture >= 0:
             found = _texel_sectors(
-                lanes, slot, texture, program.bilinear[code], place, sector_shift, first, scratch, lane_fetches, group
+                lanes,
+                slot,
+                texture,
+                program.bilinear[code],
+                place,
+                sector_shift,
+                first,
+                scratch,
+                lane_fetches,
+                group,
             )
             if found < 0:
                 return slot
@@ -317,10 +336,28 @@ def coalesce(  # type: ignore[no-untyped-def]
             num += U64(1)
         if operation == STORE:
             _store_bytes(
-                lanes, slot, texture, program.access_bytes[code], place, sector_shift, line_shift, begin, num, requests
+                lanes,
+                slot,
+                texture,
+                program.access_bytes[code],
+                place,
+                sector_shift,
+                line_shift,
+                begin,
+                num,
+                requests,
             )
         requests.segments[k + 1] = num
     return -1
 
 
-__all__ = ["Placement", "Program", "Scratch", "coalesce", "groups_of", "new_scratch", "placement_of", "program_of"]
+__all__ = [
+    "Placement",
+    "Program",
+    "Scratch",
+    "coalesce",
+    "groups_of",
+    "new_scratch",
+    "placement_of",
+    "program_of",
+]

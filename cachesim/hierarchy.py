@@ -129,7 +129,7 @@ class Hierarchy:
         """L1s (and GL1s) start empty at each launch: write back what is dirty, forget the rest; sliced levels are kept."""
         self.drain()
         top = self.levels[0]
-        if top.rules.can_be_dirty and top.state.flags[cache.DIRTY :: 32].any():
+        if top.rules.can_be_dirty and top.state.flags[cache.DIRTY :: 4].any():
             self._write_back_all(0)
         for level in self.levels:
             if level.partition is None:
@@ -261,24 +261,24 @@ class Hierarchy:
         """Write back every dirty line of a level, in line order, as stores to the next one."""
         level = self.levels[index]
         state, rules = level.state, level.rules
-        lines = np.flatnonzero(state.flags[cache.DIRTY :: 32])
+        lines = np.flatnonzero(state.flags[cache.DIRTY :: 4])
         upper = Requests(
-            line=state.tags[::4][lines],
+            line=cache.line_numbers(state, rules)[lines],
             mask=np.zeros(len(lines), np.uint8),
             meta=np.full(len(lines), STORE << GROUP_BITS, np.uint32),
             written=np.zeros(len(lines), np.int32),
             bytes_written=np.zeros((1, 8), np.uint32),
             segments=np.arange(len(lines) + 1),
-            instance=(lines // (rules.num_sets * rules.ways)).astype(np.uint32),
+            instance=(lines * rules.num_instances // (len(state.flags) // 4)).astype(np.uint32),
             order=np.arange(len(lines)),
         )
         buffer = Buffer(level, len(lines), 1)
         for s in range(rules.sectors_per_line):
-            dirty = (state.flags[cache.DIRTY :: 32][lines] >> s) & 1 == 1
+            dirty = (state.flags[cache.DIRTY :: 4][lines] >> s) & 1 == 1
             owner = state.owner[lines[dirty], s]
             np.add.at(level.counters[:, cache.WRITEBACKS], owner, 1)
             buffer.outcome.evicted_owner[dirty, s] = owner + 1
-            full = (state.flags[cache.VALID :: 32][lines] >> s) & 1 == 1
+            full = (state.flags[cache.VALID :: 4][lines] >> s) & 1 == 1
             buffer.outcome.evicted_bytes[:, s] = np.where(
                 full, rules.all_bytes, state.bytes_held[lines, s]
             )

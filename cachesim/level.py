@@ -13,6 +13,9 @@ from cachesim.stream import GROUP_BITS, STORE, Outcome, Requests
 
 _U64, _U32 = np.uint64, np.uint32
 
+#: Up to this many lines, a table holds the set of each, which is cheaper than to hash its address again and again.
+_MAX_TABLE_LINES = 1 << 23
+
 
 @njit(cache=True, nogil=True, _nrt=False)
 def _locate_in_slices(  # type: ignore[no-untyped-def]
@@ -27,7 +30,15 @@ def _locate_in_slices(  # type: ignore[no-untyped-def]
     kind, slices, table = partition.hash.kind, partition.hash.size, partition.hash.table
     for i in range(_U64(count)):
         chosen, number = slice_and_line(
-            line[i] << line_shift, channels, per_channel, run_shift, kind, slices, table, xor, line_shift
+            line[i] << line_shift,
+            channels,
+            per_channel,
+            run_shift,
+            kind,
+            slices,
+            table,
+            xor,
+            line_shift,
         )
         where[i] = chosen
         sets[i] = index_of(number, set_kind, num_sets, set_table)
@@ -35,8 +46,28 @@ def _locate_in_slices(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, _nrt=False)
+def _look_up_sets(line, count, first_line, table, sets):  # type: ignore[no-untyped-def]
+    """Set of each line from the table of `Level`."""
+    first = _U64(first_line)
+    for i in range(_U64(count)):
+        sets[i] = table[line[i] - first]
+
+
+@njit(cache=True, nogil=True, _nrt=False)
 def _sort_by_slice(  # type: ignore[no-untyped-def]
-    line, mask, meta, written, sets, where, count, next_of_slice, out_line, out_mask, out_meta, out_written, out_sets
+    line,
+    mask,
+    meta,
+    written,
+    sets,
+    where,
+    count,
+    next_of_slice,
+    out_line,
+    out_mask,
+    out_meta,
+    out_written,
+    out_sets,
 ):
     """Requests slice by slice, each slice's in their order. next_of_slice: (num_slices,) int64 first place of each, advanced."""
     for i in range(_U64(count)):
@@ -51,7 +82,7 @@ class Level:
     """The caches of one level.
 
     by_slice: whether a batch is worked off slice by slice, so that a slice's state stays in the host's own cache. The order
-        between slices is lost then, which only a level with nothing but DRAM below it may do.
+        between slices is lost then, which only a level with nothing but DRAM below it may do; small sets do not need it.
     """
 
     def __init__(
@@ -61,25 +92,41 @@ class Level:
         num_instances: int,
         num_groups: int,
         *,
-        by_slice: bool = False,
+        is_last: bool = False,
         bypass_loads: bool = False,
         bypass_stores: bool = False,
+        byte_range: tuple[int, int] | None = None,
     ) -> None:
-        """num_instances: caches that a request's SM chooses among; of a sliced level 1, whatever its number of slices."""
+        """num_instances: caches that a request's SM chooses among; of a sliced level 1, whatever its number of slices.
+
+        is_last: nothing but DRAM is below. byte_range: first address and bytes that all requests lie in, where known.
+        """
         self.name = name
         self.config = config
-        self.by_slice = by_slice
+        lines = _lines_of(byte_range, config.line_bytes)
         self.partition = partition_of(config) if isinstance(config, L2) else None
         self.hash = set_hash(config)
         self.num_slices = config.num_slices if isinstance(config, L2) else 1
         self.rules = cache.cache_rules(
             config,
-            num_instances * (self.num_slices if by_slice else 1),
+            num_instances,
             bypass_loads=bypass_loads,
             bypass_stores=bypass_stores or config.write_policy == "read-only",
+            first_line=None if lines is None else lines[0],
         )
-        if not by_slice:
+        self.by_slice = is_last and self.num_slices > 1 and not self.rules.small
+        if self.by_slice:
+            self.rules = self.rules._replace(num_instances=self.num_slices)
+        else:
             self.rules = self.rules._replace(num_sets=self.rules.num_sets * self.num_slices)
+        self._first_line, self._set_of_line = 0, np.zeros(0, np.uint32)
+        if (
+            lines is not None
+            and lines[1] <= _MAX_TABLE_LINES
+            and self.num_slices > 1
+            and not self.by_slice
+        ):
+            self._tabulate(*lines)
         self.state = cache.empty_state(self.rules)
         self.counters = np.zeros((num_groups, cache.NUM_COUNTERS), np.int64)
 
@@ -88,18 +135,18 @@ class Level:
     ) -> tuple[Requests, npt.NDArray[np.uint32]]:
         """The requests in the order in which they are worked off, and the set of each in its instance."""
         count = requests.num_requests
-        h = self.hash
-        if self.partition is None:
-            set_indices(requests.line, count, h.kind, h.size, h.table, buffer.sets)
+        if len(self._set_of_line):
+            _look_up_sets(requests.line, count, self._first_line, self._set_of_line, buffer.sets)
             return requests, buffer.sets
+        if not self.by_slice:
+            self._locate(requests.line, count, buffer.where, buffer.sets)
+            return requests, buffer.sets
+        h = self.hash
         per_slice = np.zeros(self.num_slices, np.int64)
         _locate_in_slices(
             requests.line, count, self.config.line_bytes, self.partition, h.kind, h.size, h.table,
             buffer.where, buffer.sets, per_slice,
         )  # fmt: skip
-        if not self.by_slice:
-            buffer.sets[:count] += buffer.where[:count] * _U32(h.size)
-            return requests, buffer.sets
         segments = np.concatenate([[0], np.cumsum(per_slice)])
         out = buffer.by_slice
         assert out is not None
@@ -109,9 +156,35 @@ class Level:
         )  # fmt: skip
         slices = np.arange(self.num_slices)
         arranged = out._replace(
-            bytes_written=requests.bytes_written, segments=segments, instance=slices.astype(np.uint32), order=slices
+            bytes_written=requests.bytes_written,
+            segments=segments,
+            instance=slices.astype(np.uint32),
+            order=slices,
         )
         return arranged, buffer.sets_by_slice
+
+    def _locate(
+        self,
+        line: npt.NDArray[np.uint64],
+        count: int,
+        where: npt.NDArray[np.uint32],
+        sets: npt.NDArray[np.uint32],
+    ) -> None:
+        """Set of each line, among the sets of all slices where the level is sliced. where: scratch of as many."""
+        h = self.hash
+        if self.partition is None:
+            set_indices(line, count, h.kind, h.size, h.table, sets)
+            return
+        per_slice = np.zeros(self.num_slices, np.int64)
+        _locate_in_slices(
+            line, count, self.config.line_bytes, self.partition, h.kind, h.size, h.table, where, sets, per_slice
+        )  # fmt: skip
+        sets[:count] += where[:count] * _U32(h.size)
+
+    def _tabulate(self, first_line: int, count: int) -> None:
+        line = np.arange(count, dtype=np.uint64) + _U64(first_line)
+        self._first_line, self._set_of_line = first_line, np.empty(count, np.uint32)
+        self._locate(line, count, np.empty(count, np.uint32), self._set_of_line)
 
     def access(self, requests: Requests, sets: npt.NDArray[np.uint32], outcome: Outcome) -> None:
         """Count a batch; fills `outcome`, request by request in the order given."""
@@ -132,7 +205,7 @@ class Level:
         count = np.zeros(num_groups, np.int64)
         if self.rules.can_be_dirty:
             for s in range(self.rules.sectors_per_line):
-                dirty = (self.state.flags[cache.DIRTY :: 32] >> s) & 1 == 1
+                dirty = (self.state.flags[cache.DIRTY :: 4] >> s) & 1 == 1
                 count += np.bincount(self.state.owner[dirty, s], minlength=num_groups)
         return count
 
@@ -145,9 +218,17 @@ class Buffer:
         self.sets = np.empty(num_requests, np.uint32)
         self.position = np.empty(num_requests, np.int64)
         self.outcome = cache.empty_outcome(level.rules, num_requests)
-        self.where = np.empty(num_requests if level.partition is not None else 0, np.uint16)
+        self.where = np.empty(num_requests if level.partition is not None else 0, np.uint32)
         self.by_slice = _room(num_requests, 0, 0) if level.by_slice else None
         self.sets_by_slice = np.empty(num_requests if level.by_slice else 0, np.uint32)
+
+
+def _lines_of(byte_range: tuple[int, int] | None, line_bytes: int) -> tuple[int, int] | None:
+    """First line number and number of lines of a byte range, if 32 bits can tell its lines apart."""
+    if byte_range is None:
+        return None
+    first, last = byte_range[0] // line_bytes, (byte_range[0] + byte_range[1]) // line_bytes
+    return (first, last - first + 1) if last - first < (1 << 32) - 2 else None
 
 
 def _room(num_requests: int, num_stores: int, num_segments: int) -> Requests:

@@ -29,22 +29,22 @@ U64 = np.uint64
 U32 = np.uint32
 
 # Places in a line's views, as `cachesim.cache.CacheState` describes them.
-NEWER, OLDER, RRPV = U64(3), U64(4), U64(24)
+NEWER, OLDER = U64(3), U64(4)
 
 
 @njit(cache=True, nogil=True, _nrt=False, inline="always")
 def _to_front(line, cache_set, links, newest):  # type: ignore[no-untyped-def]
-    """Make `line` the newest of its set's ring. links[newest * U64(8) + OLDER] walks back in time; links[newest * U64(8) + NEWER] is the oldest line."""
+    """Make `line` the newest of its set's ring. OLDER walks back in time; what is newer than the newest is the oldest."""
     front = newest[cache_set]
     if line != front:
-        before, after = links[line * U64(8) + NEWER], links[line * U64(8) + OLDER]
-        links[before * U64(8) + OLDER] = after
-        links[after * U64(8) + NEWER] = before
-        oldest = links[front * U64(8) + NEWER]
-        links[front * U64(8) + NEWER] = line
-        links[line * U64(8) + OLDER] = front
-        links[line * U64(8) + NEWER] = oldest
-        links[oldest * U64(8) + OLDER] = line
+        before, after = links[line * U64(6) + NEWER], links[line * U64(6) + OLDER]
+        links[before * U64(6) + OLDER] = after
+        links[after * U64(6) + NEWER] = before
+        oldest = links[front * U64(6) + NEWER]
+        links[front * U64(6) + NEWER] = line
+        links[line * U64(6) + OLDER] = front
+        links[line * U64(6) + NEWER] = oldest
+        links[oldest * U64(6) + OLDER] = line
         newest[cache_set] = line
 
 
@@ -83,22 +83,22 @@ def _pointed_way(ways, cache_set, tree):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, _nrt=False, inline="always")
-def touch(policy, line, cache_set, ways, links, flags, newest, tree):  # type: ignore[no-untyped-def]
+def touch(policy, line, cache_set, ways, links, rrpv, newest, tree):  # type: ignore[no-untyped-def]
     """A present line was accessed."""
     if policy == LRU:
         _to_front(line, cache_set, links, newest)
     elif policy == TREE_PLRU:
         _point_away(U64(line) - U64(cache_set) * ways, ways, cache_set, tree)
     elif policy == SRRIP:
-        flags[line * U64(32) + RRPV] = 0
+        rrpv[line] = 0
 
 
 @njit(cache=True, nogil=True, _nrt=False, inline="always")
-def victim(policy, cache_set, ways, links, flags, newest, fills, tree):  # type: ignore[no-untyped-def]
+def victim(policy, cache_set, ways, links, rrpv, newest, fills, tree):  # type: ignore[no-untyped-def]
     """The line of the set that a new tag replaces, marked as just inserted. Unused lines go first, in way order."""
     first = U64(cache_set) * ways
     if policy == LRU or policy == FIFO:
-        line = links[newest[cache_set] * U64(8) + NEWER]
+        line = links[newest[cache_set] * U64(6) + NEWER]
         newest[cache_set] = line
         return line
     count = fills[cache_set]
@@ -113,14 +113,14 @@ def victim(policy, cache_set, ways, links, flags, newest, fills, tree):  # type:
         way = ways
         while way == ways:
             for w in range(ways):
-                if flags[(first + U64(w)) * U64(32) + RRPV] == SRRIP_MAX:
+                if rrpv[first + U64(w)] == SRRIP_MAX:
                     way = U64(w)
                     break
             if way == ways:
                 for w in range(ways):
-                    flags[(first + U64(w)) * U64(32) + RRPV] += np.uint8(1)
+                    rrpv[first + U64(w)] += np.uint8(1)
     if policy == TREE_PLRU:
         _point_away(way, ways, cache_set, tree)
     elif policy == SRRIP:
-        flags[(first + way) * U64(32) + RRPV] = SRRIP_NEW
+        rrpv[first + way] = SRRIP_NEW
     return U32(first + way)

@@ -114,7 +114,10 @@ class _Model:
         )
         self._pairs = groups_of(trace)
         num_groups = max(1, len(self._pairs)) * MAX_MIPS
-        levels, units = hierarchy_levels(gpu, self._fetch_path, num_groups)
+        byte_range = (
+            (address_map.base_address, address_map.footprint_bytes) if address_map else None
+        )
+        levels, units = hierarchy_levels(gpu, self._fetch_path, num_groups, byte_range)
         lanes_dtype = np.uint64 if trace.is_lane_address else np.uint32
         self._dispatcher = Dispatcher(gpu.sm, units[0], lanes_dtype, BATCH_ROWS)
         self._hierarchy = Hierarchy(
@@ -206,7 +209,9 @@ class _Model:
         )
 
 
-def hierarchy_levels(gpu: Gpu, fetch_path: str, num_groups: int) -> tuple[list[Level], list[int]]:
+def hierarchy_levels(
+    gpu: Gpu, fetch_path: str, num_groups: int, byte_range: tuple[int, int] | None = None
+) -> tuple[list[Level], list[int]]:
     """The levels of a GPU under a fetch path, and per level how many L1 units share one instance (all, where sliced).
 
     The first entry of the second list is the number of L1 units per SM.
@@ -217,16 +222,29 @@ def hierarchy_levels(gpu: Gpu, fetch_path: str, num_groups: int) -> tuple[list[L
     l1: L1 = gpu.l1_texture if fetch_path == "texture" and gpu.l1_texture is not None else gpu.l1
     skips = fetch_path == "global" and gpu.l1.bypass_loads
     units = gpu.sm.count * l1.units_per_sm
-    levels = [Level("l1", l1, units, num_groups, bypass_loads=skips, bypass_stores=skips)]
+    levels = [
+        Level(
+            "l1",
+            l1,
+            units,
+            num_groups,
+            bypass_loads=skips,
+            bypass_stores=skips,
+            byte_range=byte_range,
+        )
+    ]
     sharing = [l1.units_per_sm]
     if gpu.gl1 is not None:
         per_array = gpu.gl1.sms_per_instance
-        levels.append(Level("gl1", gpu.gl1, -(-gpu.sm.count // per_array), num_groups))
+        arrays = -(-gpu.sm.count // per_array)
+        levels.append(Level("gl1", gpu.gl1, arrays, num_groups, byte_range=byte_range))
         sharing.append(per_array * l1.units_per_sm)
     for name, config in (("l2", gpu.l2), ("llc", gpu.llc)):
         if config is not None:
             is_last = name == "llc" or gpu.llc is None
-            levels.append(Level(name, config, 1, num_groups, by_slice=is_last))
+            levels.append(
+                Level(name, config, 1, num_groups, is_last=is_last, byte_range=byte_range)
+            )
             sharing.append(units)
     for upper, lower in zip(levels, levels[1:], strict=False):
         _check_sectors(gpu, upper.name, upper.config, lower.name, lower.config)

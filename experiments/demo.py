@@ -20,7 +20,7 @@ GPUS = "titan-x-pascal,rtx-2080-ti,rx-5700-xt"
 SIZE, FULL_SIZE = "960x540", "1920x1080"
 #: Measured on two cores: seconds of a first run whatever its size, and per million scattering
 #: pixels for rendering, and for counting on each GPU.
-FIRST_S, RENDER_S, COUNT_S = 30.0, 30.0, 10.0
+FIRST_S, RENDER_S, COUNT_S = 15.0, 15.0, 15.0
 MESH_HELP = "A mesh instead of the procedural head; --scenes then names cameras."
 
 
@@ -163,6 +163,7 @@ def write_results(
     for name, figure in figures.items():
         write_figure(folder / f"{name}.png", figure)
         write_figure(folder / f"{name}.pdf", figure)
-    for line in tables.scene_lines([r.gbuffer.attribution for r in results]):
-        console().print(line, markup=False)
+    if owed := tables.scene_lines([r.gbuffer.attribution for r in results]):
+        write_text(folder / "attribution.txt", "\n".join(owed) + "\n")
+        console().print("\n".join(owed), markup=False)
     remark(f"wrote tables, pictures and plots to {folder}")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -110,7 +110,7 @@ def check_fetch_path(name: str | None) -> None:
 
 def scene_arguments(
     scene: str, camera: str | None, albedo_map: Path | None, normal_map: Path | None
-) -> dict[str, object]:
+) -> dict[str, Any]:
     """Keyword arguments of `load_scene` that only a mesh takes.
 
     Raises:

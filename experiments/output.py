@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -21,8 +22,11 @@ def write_text(path: Path, text: str) -> None:
 
 def write_figure(path: Path, figure: Figure, dpi: int = 150) -> None:
     """Write a figure in the format that the suffix names, whole or not at all."""
+    # Drawn before the file is opened: matplotlib's PDF writer fails badly on a full disk.
+    drawn = BytesIO()
+    figure.savefig(drawn, dpi=dpi, format=path.suffix.removeprefix("."))
     with replacing(path) as part, writing(path):
-        figure.savefig(part, dpi=dpi)
+        part.write_bytes(drawn.getbuffer())
 
 
 def output_file(path: Path, *suffixes: str) -> Path:

@@ -49,6 +49,9 @@ def command(
     machine = presets.load(gpu, overrides)
     folder = output_folder(output)
     opened = open_device(device)
+    gbuffers = [load_scene(name, width, height, device=opened) for name in names]
+    seconds = study.estimate_s(gbuffers, numbers)
+    remark(f"{size} on {opened.name}: about {seconds:,.0f} s on two cores")
     frames = []
     num_cases = len(list(study.cases(numbers)))
     with progress("starting", len(names) * num_cases) as bar:
@@ -57,12 +60,10 @@ def command(
             bar.advance()
             bar.describe(text)
 
-        for name in names:
-            gbuffer = load_scene(name, width, height, device=opened)
+        for gbuffer in gbuffers:
+            name = gbuffer.name
             frames.append(
-                study.measure(
-                    gbuffer.name, gbuffer, machine, counts=numbers, device=opened, step=step
-                )
+                study.measure(name, gbuffer, machine, counts=numbers, device=opened, step=step)
             )
     table = study.effect_table(pd.concat(frames, ignore_index=True), machine.name, size)
     print_table(table)

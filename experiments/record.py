@@ -18,7 +18,7 @@ from experiments.options import (
 )
 
 #: Bytes of the file per lane that a row has, at the least and at the most that we have measured.
-FILE_BYTES_PER_LANE = (0.5, 1.8)
+FILE_BYTES_PER_LANE = (0.25, 1.0)
 OUTPUT_HELP = "The recording."
 FRAMES_HELP = "Frames to render, which build up the history."
 TRACED_HELP = "Which frames to record: the last, all, or a list of numbers from 0."

@@ -41,7 +41,7 @@ def command(
     """Render a scene: without scattering, with it, and the map of sample counts."""
     from experiments.console import progress, remark
     from experiments.options import parse_image_size, scene_arguments
-    from experiments.output import output_folder, write_figure
+    from experiments.output import output_folder, write_figure, write_text
 
     width, height = parse_image_size(size)
     mesh = scene_arguments(scene, camera, albedo_map, normal_map)
@@ -76,6 +76,8 @@ def command(
     save_png(folder / f"{stem}-{method}.png", tone_map(frame.combined))
     figure = count_map(frame.counts, f"{gbuffer.name}, frame {frame.index}", gbuffer.attribution)
     write_figure(folder / f"{stem}-{method}-counts.png", figure)
+    if gbuffer.attribution:
+        write_text(folder / "attribution.txt", gbuffer.attribution + "\n")
     mean = frame.num_samples / int(gbuffer.subsurface.sum())
     for line in (
         f"{gbuffer.name} {width}x{height} on {opened.name}: coverage "

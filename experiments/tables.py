@@ -9,7 +9,7 @@ from pathlib import Path
 from textwrap import wrap
 from typing import TYPE_CHECKING, Any
 
-from experiments.console import console
+from experiments.console import PLAIN_WIDTH, console
 from experiments.output import write_text
 
 if TYPE_CHECKING:
@@ -114,6 +114,8 @@ def print_table(table: Table) -> None:
 
     out = console()
     shown = cells(table)
+    # A terminal folds a line that is too long for it; rich would cut numbers short.
+    out.width = max(out.width, PLAIN_WIDTH, _narrowest(table, shown))
     made = RichTable(
         title=table.title,
         title_justify="left",
@@ -143,19 +145,32 @@ def print_table(table: Table) -> None:
         out.print()
 
 
+def _widths(table: Table, shown: list[list[str]]) -> list[int]:
+    """The least width of each column: its longest cell or word of its heading."""
+    return [
+        max([len(row[i]) for row in shown] + [len(word) for word in column.heading.split()])
+        for i, column in enumerate(table.columns)
+    ]
+
+
+def _narrowest(table: Table, shown: list[list[str]]) -> int:
+    """The least width of the table without the columns that wrap."""
+    pairs = zip(table.columns, _widths(table, shown), strict=True)
+    return sum(width + 2 for column, width in pairs if not column.wraps)
+
+
 def _headings(table: Table, shown: list[list[str]], width: int) -> list[str]:
     """The headings, in several lines where the table would be wider than the console.
 
     Only headings and long text may take several lines; a number in two lines would be two numbers.
     """
     words = [c.heading for c in table.columns]
-    longest = [max((len(row[i]) for row in shown), default=0) for i in range(len(words))]
-    full = sum(max(n, len(w)) for n, w in zip(longest, words, strict=True)) + 2 * len(words)
+    least = _widths(table, shown)
+    full = sum(max(n, len(w)) + 2 for n, w in zip(least, words, strict=True))
     if full <= width or any(c.wraps for c in table.columns):
         return words
     return [
-        "\n".join(wrap(w, max(n, *map(len, w.split())), break_on_hyphens=False))
-        for n, w in zip(longest, words, strict=True)
+        "\n".join(wrap(w, n, break_on_hyphens=False)) for n, w in zip(least, words, strict=True)
     ]
 
 

@@ -68,13 +68,13 @@ CAMERAS: dict[str, Camera] = {
     camera.name: camera
     for camera in (
         Camera(
-            "close", (-7.5, -5.0, 24.0), (-2.2, -4.0, 8.4), coverage_rate=1.0, pixels_per_mm=18.0
+            "close", (-7.5, -5.0, 24.0), (-2.2, -4.0, 8.4), coverage_rate=1.0, pixels_per_mm=21.8
         ),
-        Camera("ear", (27.0, 1.0, 4.0), (6.8, -1.7, -1.1), coverage_rate=0.9, pixels_per_mm=18.0),
+        Camera("ear", (27.0, 1.0, 4.0), (6.8, -1.7, -1.1), coverage_rate=0.90, pixels_per_mm=17.6),
         Camera(
             "front", (0.0, -2.0, 140.0), (0.0, -3.5, 0.0), coverage_rate=0.13, pixels_per_mm=2.7
         ),
-        Camera("side", (104.0, -2.0, 1.0), (0.0, -2.0, 0.0), coverage_rate=0.3, pixels_per_mm=4.2),
+        Camera("side", (104.0, -2.0, 1.0), (0.0, -2.0, 0.0), coverage_rate=0.27, pixels_per_mm=3.6),
     )
 }
 

@@ -45,11 +45,10 @@ def load_npz(path: str | Path, projection_x: float | None = None) -> GBuffer:
     """
     path = _existing(path)
     try:
-        with np.load(path, allow_pickle=False) as archive:
+        with path.open("rb") as file:
+            archive = np.load(file, allow_pickle=False)
             if not isinstance(archive, np.lib.npyio.NpzFile):
-                raise InputError(
-                    f"{path}: a single array; need an .npz file with one array per field"
-                )
+                raise InputError(f"{path}: one array; need an .npz file with an array per field")
             fields = {name: _member(path, archive, name) for name in archive.files}
     except (zipfile.BadZipFile, ValueError, EOFError, OSError) as error:
         if isinstance(error, InputError):
@@ -62,7 +61,7 @@ def load_npz(path: str | Path, projection_x: float | None = None) -> GBuffer:
             f"{path}: projection_x: {stored.dtype} of shape {stored.shape}: need one number"
         )
     number = float(stored.reshape(())) if stored is not None else None
-    return _gbuffer(path, fields, projection_x or number, **texts)
+    return _gbuffer(path, fields, number if projection_x is None else projection_x, **texts)
 
 
 def save_npz(path: str | Path, gbuffer: GBuffer) -> None:
@@ -87,7 +86,7 @@ def load_exr(path: str | Path, projection_x: float | None = None) -> GBuffer:
 
     try:
         with OpenEXR.File(str(path), separate_channels=True) as file:
-            header, channels = file.header(), file.channels()
+            header, channels = dict(file.header()), file.channels()
             pixels = {name: channel.pixels for name, channel in channels.items()}
     # OpenEXR raises RuntimeError, and other kinds for headers that it half understands
     except Exception as error:
@@ -112,7 +111,8 @@ def load_exr(path: str | Path, projection_x: float | None = None) -> GBuffer:
         fields["profile_id"] = ids.astype(np.int64)
     number = header.get("projectionX")
     attribution = str(header.get("attribution", ""))
-    return _gbuffer(path, fields, projection_x or number, attribution=attribution, name="")
+    projection_x = number if projection_x is None else projection_x
+    return _gbuffer(path, fields, projection_x, attribution=attribution, name="")
 
 
 def save_exr(path: str | Path, gbuffer: GBuffer) -> None:

@@ -21,7 +21,7 @@ import numpy as np
 
 from kernels.driver_noise import noise_kept, short_reason
 from kernels.icd import use_all_drivers
-from traces.errors import unknown
+from traces.errors import WorkError, unknown
 
 if TYPE_CHECKING:
     import pyopencl as cl
@@ -45,7 +45,7 @@ void probe(global const float *value, global float *out, global uint *bits) {
 """
 
 
-class DeviceError(RuntimeError):
+class DeviceError(WorkError):
     """The OpenCL device failed while working. The command line prints it and exits with code 1."""
 
 

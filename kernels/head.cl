@@ -5,6 +5,8 @@
 #define MAX_STEPS 192
 #define MAX_SHADOW_STEPS 56
 #define FAR_CM 1.0e6f
+// Pixels larger than this (cm) do not make the surface any coarser.
+#define COARSEST 0.15f
 
 // The bust lies inside this sphere: rays that miss it see the background.
 #define BOUND_CENTRE ((float3)(0.0f, -12.0f, -2.0f))
@@ -32,9 +34,12 @@ HEAD_INLINE float3 head_direction(float4 right, float4 up, float4 forward, float
 }
 
 __kernel void head_start(float4 origin, float4 right, float4 up, float4 forward, int width, int height, int first_row,
-                         int tiles_x, __global const float* restrict grid, __global float* restrict start)
+                         int rows, int tiles_x, __global const float* restrict grid,
+                         __global float* restrict start)
 {
     int tile_x = get_global_id(0), tile_y = get_global_id(1);
+    if (tile_x >= tiles_x || tile_y * TILE >= rows)
+        return;
     float x = (float)(tile_x * TILE) + 0.5f * TILE - 0.5f * (float)width;
     float y = 0.5f * (float)height - ((float)(first_row + tile_y * TILE) + 0.5f * TILE);
     float3 direction = head_direction(right, up, forward, x, y);
@@ -98,7 +103,7 @@ HEAD_INLINE float head_occlusion(__global const float* restrict grid, float3 p, 
 }
 
 __kernel void head_render(float4 origin, float4 right, float4 up, float4 forward, int width, int height, int first_row,
-                          int tiles_x, __global const float* restrict grid,
+                          int rows, int tiles_x, __global const float* restrict grid,
                           __global const float* restrict start, int num_lights,
                           __global const float* restrict lights, float4 ambient, float4 background,
                           __global float* restrict irradiance, __global float* restrict albedo,
@@ -106,6 +111,8 @@ __kernel void head_render(float4 origin, float4 right, float4 up, float4 forward
                           __global float* restrict normal, __global uchar* restrict profile)
 {
     int column = get_global_id(0), row = get_global_id(1);
+    if (column >= width || row >= rows)
+        return;
     size_t pixel = (size_t)row * width + column;
     float3 direction = head_direction(right, up, forward, (float)column + 0.5f - 0.5f * (float)width,
                                       0.5f * (float)height - ((float)(first_row + row) + 0.5f));
@@ -120,7 +127,7 @@ __kernel void head_render(float4 origin, float4 right, float4 up, float4 forward
         for (int step = 0; step < MAX_STEPS; ++step) {
             float d = head_far(grid, origin.xyz + direction * t);
             t += d * 0.95f * inverse;
-            if (d < 0.5f * right.w * t) {
+            if (d < 0.5f * fmin(right.w * t, COARSEST)) {
                 hit = true;
                 break;
             }
@@ -142,7 +149,7 @@ __kernel void head_render(float4 origin, float4 right, float4 up, float4 forward
     t += head_distance(origin.xyz + direction * t) * inverse;
     float3 p = origin.xyz + direction * t;
     float footprint = right.w * t;
-    float3 smooth = head_normal(p, fmax(0.5f * footprint, 0.004f));
+    float3 smooth = head_normal(p, fmax(0.5f * fmin(footprint, COARSEST), 0.004f));
     float skin = head_skin(p);
     HeadSurface s;
     if (p.z > 5.0f && head_eyeball(p) < skin)
@@ -159,7 +166,7 @@ __kernel void head_render(float4 origin, float4 right, float4 up, float4 forward
     float grazing = 1.0f - head_saturate(-head_dot(n, unit));
     float fresnel = grazing * grazing * grazing * grazing * grazing;
     float3 mirrored = ambient.xyz * (occlusion * occlusion * (s.reflectance + (0.25f - 0.3f * s.roughness) * fresnel));
-    float3 lifted = p + smooth * (0.02f + footprint);
+    float3 lifted = p + smooth * (0.02f + fmin(footprint, COARSEST));
     for (int index = 0; index < num_lights; ++index) {
         __global const float* light = lights + index * 8;
         float3 to_light = (float3)(light[0], light[1], light[2]);

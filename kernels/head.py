@@ -24,6 +24,9 @@ if TYPE_CHECKING:
 
 SOURCE_FILES = ("head_shape.cl", "head_skin.cl", "head.cl")
 TILE = 8
+# Work-group sizes are fixed, as PoCL compiles a kernel anew for every size it meets.
+START_GROUP = (4, 4)
+RENDER_GROUP = (16, 4)
 # Nodes of the distance grid, as in head_shape.cl.
 GRID = (54, 168, 132)
 # Pixels in flight on the device at once: 53 bytes each, so 14 MB whatever the size of the picture.
@@ -91,14 +94,16 @@ def render_head(
             np.int32(width),
             np.int32(height),
             np.int32(first_row),
+            np.int32(rows),
             np.int32(tiles_x),
             grid,
         )
-        start_kernel(device.queue, (tiles_x, -(-rows // TILE)), None, *geometry, start)
+        tiles = (tiles_x, -(-rows // TILE))
+        start_kernel(device.queue, _padded(tiles, START_GROUP), START_GROUP, *geometry, start)
         render_kernel(
             device.queue,
-            (width, rows),
-            None,
+            _padded((width, rows), RENDER_GROUP),
+            RENDER_GROUP,
             *geometry,
             start,
             np.int32(len(lights)),
@@ -142,6 +147,11 @@ def _view(camera: Camera, width: int) -> list[npt.NDArray[Any]]:
         _float4((*up, pixel)),
         _float4(forward),
     ]
+
+
+def _padded(size: tuple[int, int], group: tuple[int, int]) -> tuple[int, int]:
+    """The next multiple of the work-group; the kernels leave out what lies beyond."""
+    return -(-size[0] // group[0]) * group[0], -(-size[1] // group[1]) * group[1]
 
 
 def _float4(values: tuple[float, ...] | npt.NDArray[Any]) -> npt.NDArray[Any]:

@@ -31,8 +31,8 @@ ABOVE_EARS = 0.4
 # A smooth normal farther than this from its face's own belongs to an edge: the face's is used
 # (cosine of 45 degrees).
 EDGE_COSINE = 0.7071
-# With fewer seam vertices than this, the map's orientation is not judged.
-MIN_SEAM = 16
+# A map counts as upside down only where v and height are correlated at least so strongly.
+MIN_CORRELATION = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,8 +81,8 @@ def load_mesh(
 
     albedo_map: sRGB image; None takes the file's own base colour map or colour.
     normal_map: tangent-space image, +y up; None takes the file's own.
-    flip_v: whether v runs against the format's rule (glTF's points down); None judges by the albedo
-    map, which must agree with itself across the seams of the uv map.
+    flip_v: whether v runs against the format's rule (glTF's points down), as maps from outside the
+    file often need; None turns them where v falls with height over the mesh's front.
     height_cm: the bounding box is scaled to this height, as files rarely say their unit truly; None
     scales the head, as `_head_box` finds it, to 23 cm from crown to chin.
     up, forward: the file's axes that become +y and +z, as "+y", "-x" and so on.
@@ -130,9 +130,9 @@ def load_mesh(
     own_normals = material.get("normal_map") if uv is not None else None
     albedo_source = albedo_map if albedo_map is not None else own_albedo
     normal_source = normal_map if normal_map is not None else own_normals
-    albedo_image = None if albedo_source is None else load_albedo(albedo_source)
     if flip_v is None:
-        flip_v = albedo_image is not None and _seams_fit_flipped(corners, corner_uv, albedo_image)
+        is_given = albedo_map is not None or normal_map is not None
+        flip_v = is_given and _stands_on_its_head(corners, corner_uv, areas)
     if flip_v:
         corner_uv = corner_uv * [1, -1] + [0, 1]
     tangents, handedness, uv_areas = _tangents(corners, corner_uv, faces, len(positions))
@@ -148,7 +148,7 @@ def load_mesh(
         head_centre=(head_centre - (low + high) / 2) * scale,
         head_height=head_height * scale,
         albedo=material.get("albedo", SKIN),
-        albedo_map=albedo_image,
+        albedo_map=None if albedo_source is None else load_albedo(albedo_source),
         normal_map=None if normal_source is None else load_normals(normal_source),
     )
 
@@ -244,25 +244,19 @@ def _tangents(
     return total[faces], np.where(area < 0, -1.0, 1.0), np.abs(area)
 
 
-def _seams_fit_flipped(
-    corners: npt.NDArray[np.float64], uv: npt.NDArray[np.float64], image: ImageMap
+def _stands_on_its_head(
+    corners: npt.NDArray[np.float64], uv: npt.NDArray[np.float64], areas: npt.NDArray[np.float64]
 ) -> bool:
-    """Whether the image's colours on the two sides of the uv map's seams agree clearly better
-    upside down.
-    """
-    points = np.concatenate([corners, uv], axis=2).reshape(-1, 5)
-    points = np.unique(points[np.isfinite(points).all(axis=1)], axis=0)
-    # Sorted by position: neighbours at one place with two uvs are the two sides of a seam
-    seam = np.flatnonzero((points[1:, :3] == points[:-1, :3]).all(axis=1))
-    if len(seam) < MIN_SEAM:
+    """Whether v falls with height over the front: maps of heads are painted upright."""
+    edges = corners[:, 1:] - corners[:, :1]
+    facing = np.cross(edges[:, 0], edges[:, 1])[:, 2] / areas
+    weight = np.repeat(areas * np.maximum(facing, 0), 3)
+    if not weight.any():
         return False
-
-    def mismatch(flip: bool) -> float:
-        where = points[:, 3:] * [1, -1] + [0, 1] if flip else points[:, 3:]
-        colours = image.sample(where.astype(np.float32), np.full(len(where), 4, np.float32))
-        return float(np.abs(colours[seam + 1] - colours[seam]).mean())
-
-    return mismatch(True) < 0.7 * mismatch(False)
+    height, v = corners[:, :, 1].reshape(-1), uv[:, :, 1].reshape(-1)
+    height, v = (value - np.average(value, weights=weight) for value in (height, v))
+    spread = np.sqrt((weight * height**2).sum() * (weight * v**2).sum())
+    return bool((weight * height * v).sum() < -MIN_CORRELATION * spread)
 
 
 def _texture(mesh: trimesh.Trimesh) -> tuple[npt.NDArray[np.float64] | None, dict[str, Any]]:

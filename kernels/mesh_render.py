@@ -234,7 +234,7 @@ def _visible_share(caster: _Caster, origins: Float, light: Light) -> Float:
     hidden = np.stack([caster.blocked(origins, _repeat(ray, len(origins))) for ray in rim]).sum(
         axis=0
     )
-    share = (hidden == 0).astype(np.float32)
+    share: Float = (hidden == 0).astype(np.float32)
     mixed = np.flatnonzero((hidden > 0) & (hidden < len(rim)))
     if len(mixed):
         points = np.ascontiguousarray(origins[mixed])
@@ -275,12 +275,12 @@ def _corner_occlusion(mesh: Mesh, caster: _Caster) -> Float:
     angle = index * np.pi * (3 - np.sqrt(5))
     ring = np.sqrt(1 - z * z)
     sphere = np.stack([ring * np.cos(angle), ring * np.sin(angle), z], axis=1).astype(np.float32)
-    seen = np.zeros(len(unique), np.float32)
+    seen: Float = np.zeros(len(unique), np.float32)
     for point in sphere:
         seen += ~caster.blocked(
             origins, np.ascontiguousarray(_unit(normal * np.float32(1.001) + point))
         )
-    share: Float = (seen / OCCLUSION_RAYS)[back.reshape(-1)].reshape(-1, 3)
+    share: Float = (seen / np.float32(OCCLUSION_RAYS))[back.reshape(-1)].reshape(-1, 3)
     return share
 
 

@@ -36,8 +36,8 @@ class Line:
 
 @dataclass
 class Answer:
-    """Sectors passed down as the request itself and fetched for it; sector -> (group, bytes) written
-    back of line `evicted`."""
+    """down: sectors passed down as the request itself. fill: sectors fetched for it. written_back:
+    sector -> (group, bytes) of line `evicted`."""
 
     down: set[int]
     fill: set[int] = field(default_factory=set)
@@ -170,7 +170,9 @@ class ReferenceCache:
             return answer
         for s in sectors:
             atomic = operation == ATOMIC
-            self._write(line, s, atomic, self.every_byte if atomic else bytes_written[s], group, answer)
+            self._write(
+                line, s, atomic, self.every_byte if atomic else bytes_written[s], group, answer
+            )
         count("stores_down", len(answer.down))
         count("write_fills", len(answer.fill))
         return answer

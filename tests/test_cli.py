@@ -397,6 +397,23 @@ def test_an_interrupted_recording_leaves_nothing_half_written(folder: Path) -> N
     assert list(folder.iterdir()) == []
 
 
+def test_no_device_is_one_line_and_exit_code_1(
+    folder: Path, without_opencl: dict[str, str]
+) -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "experiments.cli", "record", "--size", "16x8", "-o", "t.parquet"],
+        capture_output=True,
+        text=True,
+        check=False,
+        env=without_opencl,
+    )
+    assert done.returncode == 1, done.stderr
+    assert "Traceback" not in done.stderr
+    assert done.stderr.strip().splitlines()[-1].startswith("cachesim: error: ")
+    assert "OpenCL" in done.stderr
+    assert list(folder.iterdir()) == []
+
+
 def test_no_space_on_the_disk_is_one_line_and_exit_code_1(
     folder: Path,
     trace_file: Path,

@@ -109,9 +109,13 @@ def test_console_table_fits_a_hundred_columns_and_blanks_repeated_words(
     assert "A note." in lines
 
 
-def test_numbers_are_never_wrapped_however_narrow_the_console(
+def test_nothing_is_cut_short_however_narrow_the_terminal(
     table: Table, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("experiments.console.PLAIN_WIDTH", 40)
+    monkeypatch.setattr("experiments.console.PLAIN_WIDTH", 20)
+    monkeypatch.setattr("experiments.tables.PLAIN_WIDTH", 20)
     print_table(table)
-    assert "1,234,567" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    for words in ("1,234,567", "50% & more", "0.877"):
+        assert any(words in line for line in said.splitlines())
+    assert "…" not in said

@@ -1,0 +1,32 @@
+"""The columns of a level's counters, and the codes of its rules."""
+
+from __future__ import annotations
+
+import numpy as np
+
+# Columns of the counters: all in the level's sectors, except REQUESTS.
+(
+    REQUESTS,
+    ACCESSES,
+    HITS,
+    LINE_MISSES,
+    SECTOR_MISSES,
+    WRITES,
+    WRITE_MISSES,
+    STORES_DOWN,
+    WRITE_FILLS,
+    BYPASSES,
+    BYPASSED_WRITES,
+    WRITEBACKS,
+) = range(12)
+NUM_COUNTERS = 12
+
+# What a store does on a present sector, and on an absent one (facts sheet 3.2, `wr` and `wralloc`).
+HIT_THROUGH, HIT_BACK, HIT_EVICT = range(3)
+MISS_NONE, MISS_ALLOCATE, MISS_FETCH, MISS_LAZY = range(4)
+
+# Places in a line's four flag bytes: whether it holds a tag, its readable sectors, those written in part and not readable, those
+# to write back.
+USED, VALID, PARTIAL, DIRTY = np.uint64(0), np.uint64(1), np.uint64(2), np.uint64(3)
+
+POPCOUNT = np.array([bin(m).count("1") for m in range(256)], np.int64)
