@@ -174,7 +174,7 @@ class _RecordedLevel(Level):
         caches = 1 if level.partition is not None else level.rules.num_instances
         skips = bool(level.rules.bypass_loads)
         super().__init__(
-            level.name, level.config, caches, 1, by_slice=level.by_slice, bypass_loads=skips
+            level.name, level.config, caches, 1, is_last=level.by_slice, bypass_loads=skips
         )
         whole_lines = {"sector_bytes": level.config.line_bytes, "write_policy": "read-only"}
         self._policies = {
@@ -183,7 +183,7 @@ class _RecordedLevel(Level):
                 level.config.model_copy(update={**whole_lines, "replacement": name}),
                 caches,
                 1,
-                by_slice=level.by_slice,
+                is_last=level.by_slice,
             )
             for name in dict.fromkeys(("lru", level.config.replacement))
         }

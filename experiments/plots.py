@@ -177,7 +177,7 @@ def sweep_figure(frame: pd.DataFrame, axes_fields: Sequence[str], title: str) ->
         axes.set_xticks(range(len(ticks)), [_axis_text(first, t) for t in ticks])
         axes.tick_params(axis="x", rotation=30)
         axes.set_xlabel(first, fontsize=FONT_SIZE)
-        axes.set_ylim(bottom=0)
+        axes.set_ylim(0, 1.08 * axes.get_ylim()[1])
         _style(axes)
     if others:
         handles, names = panels[0].get_legend_handles_labels()

@@ -167,6 +167,7 @@ def test_cache_equals_the_reference_bit_for_bit(case) -> None:
             assert counters[:, column].tolist() == expected, name
     dirty = Counter()
     if rules.can_be_dirty:
+        flags = state.flags.reshape(len(state.owner), -1)
         for s in range(8):
             held = (state.flags[cache.DIRTY :: 4] >> s) & 1 == 1
             dirty.update(state.owner[held, s].tolist())

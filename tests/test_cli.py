@@ -1,5 +1,6 @@
 """The command line: exit codes, one line for bad input, JSON as designed, whole outputs."""
 
+import io
 import json
 import os
 import re
@@ -12,7 +13,9 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from rich.console import Console
 
+from experiments import console
 from experiments.cli import run_command
 from traces.parquet import write_parquet
 from traces.synthetic import scatter, stream
@@ -395,6 +398,21 @@ def test_an_interrupted_recording_leaves_nothing_half_written(folder: Path) -> N
     assert error.strip().splitlines()[-1] == "cachesim: error: interrupted"
     assert "Traceback" not in error
     assert list(folder.iterdir()) == []
+
+
+@pytest.mark.parametrize(("seconds", "is_shown"), [(0.4, True), (0.0, False)])
+def test_a_progress_bar_shows_itself_only_for_long_work(
+    seconds: float, is_shown: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    terminal = io.StringIO()
+    monkeypatch.setattr(
+        console, "console", lambda stderr: Console(file=terminal, force_terminal=True)
+    )
+    monkeypatch.setattr(console.Progress, "SHOW_AFTER_S", 0.1)
+    with console.progress("counting sheep", 10) as bar:
+        time.sleep(seconds)
+        bar.update(5)
+    assert ("counting sheep" in terminal.getvalue()) is is_shown
 
 
 def test_no_device_is_one_line_and_exit_code_1(

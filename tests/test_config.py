@@ -70,7 +70,8 @@ def test_what_is_not_a_size_is_refused_with_its_value(text: Any) -> None:
     [
         ({"sector_bytes": 48}, "sector_bytes = 48: allowed are powers of two"),
         ({"sector_bytes": 256}, "sector_bytes = 256 does not divide line_bytes = 128"),
-        ({"sector_bytes": 8}, "16 sectors per line; allowed are up to 8"),
+        ({"sector_bytes": 8}, "sector_bytes = 8: allowed are powers of two from 16 to 4096"),
+        ({"line_bytes": 256, "sector_bytes": 16}, "16 sectors per line; allowed are up to 8"),
         ({"line_bytes": 96}, "line_bytes = 96: allowed are powers of two"),
         ({"capacity": 32769}, "capacity = 32769 B is not a multiple of .* = 512 B"),
         ({"ways": 40000, "capacity": 40000 * 128}, "ways = 40000, 1 sets: too large"),
