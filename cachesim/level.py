@@ -9,6 +9,7 @@ from numba import njit
 from cachesim import cache
 from cachesim.address import index_of, partition_of, set_hash, set_indices, slice_and_line
 from cachesim.config import L2, CacheLevel
+from cachesim.counts import POPCOUNT
 from cachesim.stream import GROUP_BITS, STORE, Outcome, Requests
 
 _U64, _U32 = np.uint64, np.uint32
@@ -46,11 +47,15 @@ def _locate_in_slices(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, _nrt=False)
-def _look_up_sets(line, count, first_line, table, sets):  # type: ignore[no-untyped-def]
-    """Set of each line from the table of `Level`."""
-    first = _U64(first_line)
+def _look_up_sets(line, mask, count, first_line, table, seen, sets):  # type: ignore[no-untyped-def]
+    """Set of each line from the table of `Level`; returns how many sectors were asked for the first time."""
+    first, new = _U64(first_line), 0
     for i in range(_U64(count)):
-        sets[i] = table[line[i] - first]
+        at = line[i] - first
+        sets[i] = table[at]
+        new += POPCOUNT[mask[i] & ~seen[at]]
+        seen[at] |= mask[i]
+    return new
 
 
 @njit(cache=True, nogil=True, _nrt=False)
@@ -120,6 +125,9 @@ class Level:
         else:
             self.rules = self.rules._replace(num_sets=self.rules.num_sets * self.num_slices)
         self._first_line, self._set_of_line = 0, np.zeros(0, np.uint32)
+        self._seen = np.zeros(0, np.uint8)
+        # Distinct sectors asked of all instances together, which a level that is never emptied misses at least; None: not counted.
+        self.num_distinct: int | None = None
         if (
             lines is not None
             and lines[1] <= _MAX_TABLE_LINES
@@ -136,7 +144,10 @@ class Level:
         """The requests in the order in which they are worked off, and the set of each in its instance."""
         count = requests.num_requests
         if len(self._set_of_line):
-            _look_up_sets(requests.line, count, self._first_line, self._set_of_line, buffer.sets)
+            assert self.num_distinct is not None
+            self.num_distinct += _look_up_sets(
+                requests.line, requests.mask, count, self._first_line, self._set_of_line, self._seen, buffer.sets
+            )  # fmt: skip
             return requests, buffer.sets
         if not self.by_slice:
             self._locate(requests.line, count, buffer.where, buffer.sets)
@@ -184,6 +195,7 @@ class Level:
     def _tabulate(self, first_line: int, count: int) -> None:
         line = np.arange(count, dtype=np.uint64) + _U64(first_line)
         self._first_line, self._set_of_line = first_line, np.empty(count, np.uint32)
+        self._seen, self.num_distinct = np.zeros(count, np.uint8), 0
         self._locate(line, count, np.empty(count, np.uint32), self._set_of_line)
 
     def access(self, requests: Requests, sets: npt.NDArray[np.uint32], outcome: Outcome) -> None:

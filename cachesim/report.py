@@ -127,7 +127,8 @@ class Report:
     """What one trace asked of one GPU.
 
     gpu: preset name. trace: identification of the trace. counters: by level, from the SM down. parts: None for a trace without
-    provenance. num_rows: warp instructions issued. cycles, time_ms: None without timing. timings: host seconds per stage.
+    provenance. num_rows: warp instructions issued. distinct_sectors: of the sliced levels, which are never emptied, how many
+    different sectors were asked (compulsory misses); levels for which it was not counted are absent. cycles, time_ms: None without timing. timings: host seconds per stage.
     """
 
     gpu: str
@@ -139,6 +140,7 @@ class Report:
     counters: dict[str, LevelCounters]
     dram: DramCounters
     parts: tuple[Part, ...] | None
+    distinct_sectors: dict[str, int] = field(default_factory=dict)
     cycles: dict[str, int] | None = None
     time_ms: float | None = None
     timings: dict[str, float] = field(default_factory=dict, compare=False)
@@ -171,6 +173,13 @@ class Report:
                 f"{upper} passes down what {lower} is presented",
                 passed,
                 d.presented * d.sector_bytes,
+            )
+        for name, distinct in self.distinct_sectors.items():
+            misses = self.counters[name].misses
+            _law(
+                f"{name}: misses = {misses} >= {distinct} distinct sectors",
+                True,
+                misses >= distinct,
             )
         last = self.counters[names[-1]]
         moved = (last.reads_down + last.writes_down) * last.sector_bytes
@@ -214,7 +223,10 @@ class Report:
             "fetch_path": self.fetch_path,
             "layout": self.layout,
             "levels": list(self.levels),
-            **{name: c.to_json() for name, c in self.counters.items()},
+            **{
+                name: c.to_json() | {"distinct_sectors": self.distinct_sectors.get(name)}
+                for name, c in self.counters.items()
+            },
             "dram": self.dram.to_json(),
             "demand": self.demand,
             "warp_instructions": self.num_rows,

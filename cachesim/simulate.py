@@ -205,6 +205,11 @@ class _Model:
             counters=counters,
             dram=_dram(gpu, counters),
             parts=None if self._trace.is_lane_address else tuple(parts),
+            distinct_sectors={
+                level.name: level.num_distinct
+                for level in levels
+                if level.num_distinct is not None and not level.rules.bypass_loads
+            },
             timings=dict(hierarchy.timings),
         )
 

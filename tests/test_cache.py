@@ -82,10 +82,12 @@ def requests_of(
 
 @st.composite
 def cases(draw):
-    """A level, its instances and bypasses, and two batches of requests to it."""
-    policy = draw(st.sampled_from(POLICIES))
+    """A level, its instances, bypasses and first line, and two batches of requests to it."""
+    # A first line, up to 16 ways and LRU or FIFO make the sets small (`cachesim.lookup`).
+    first_line = draw(st.sampled_from([None, 0, 2**40 + 7]))
+    policy = draw(st.sampled_from(POLICIES if first_line is None else ("lru", "fifo", "srrip")))
     num_sets = draw(st.one_of(st.integers(1, 7), st.sampled_from([16, 33])))
-    ways = draw(st.one_of(st.integers(1, 8), st.integers(9, 64 if policy == "tree-plru" else 100)))
+    ways = draw(st.one_of(st.integers(1, 16), st.integers(9, 64 if policy == "tree-plru" else 100)))
     line_bytes, sector_bytes = draw(
         st.sampled_from(
             [(128, 32), (128, 128), (64, 64), (256, 32), (128, 16), (16, 16), (4096, 512)]
@@ -108,16 +110,17 @@ def cases(draw):
     random = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
     # From mostly hits to mostly misses; anywhere in the 64-bit range.
     num_lines = max(1, int(num_sets * ways * draw(st.sampled_from([0.5, 1.1, 2, 6]))))
-    base = draw(st.sampled_from([0, 2**40 - 3, 2**64 - num_lines]))
+    lowest, highest = (0, 2**64 - 1) if first_line is None else (first_line, first_line + 2**32 - 2)
+    base = draw(st.sampled_from([lowest, highest - num_lines + 1]))
     pool = np.uint64(base) + np.arange(num_lines, dtype=np.uint64)
     if draw(st.booleans()):
-        pool = random.integers(0, 2**64, num_lines, dtype=np.uint64)
+        pool = random.integers(lowest, highest, num_lines, dtype=np.uint64, endpoint=True)
     store_rate = draw(st.sampled_from([0.0, 0.3, 0.8]))
     batches = [
         batch_of(random, pool, level, num_instances, draw(st.integers(0, 400)), store_rate)
         for _ in range(2)
     ]
-    return level, num_instances, bypass_loads, bypass_stores, batches
+    return level, num_instances, bypass_loads, bypass_stores, first_line, batches
 
 
 def batch_of(random, pool, level, num_instances, n, store_rate):
@@ -146,12 +149,16 @@ def sectors_in(mask: int) -> set[int]:
     return {s for s in range(8) if mask >> s & 1}
 
 
-@settings(max_examples=150)
+@settings(max_examples=250)
 @given(cases())
 def test_cache_equals_the_reference_bit_for_bit(case) -> None:
-    level, num_instances, bypass_loads, bypass_stores, batches = case
+    level, num_instances, bypass_loads, bypass_stores, first_line, batches = case
     rules = cache.cache_rules(
-        level, num_instances, bypass_loads=bypass_loads, bypass_stores=bypass_stores
+        level,
+        num_instances,
+        bypass_loads=bypass_loads,
+        bypass_stores=bypass_stores,
+        first_line=first_line,
     )
     state = cache.empty_state(rules)
     counters = np.zeros((NUM_GROUPS, cache.NUM_COUNTERS), np.int64)
@@ -169,7 +176,7 @@ def test_cache_equals_the_reference_bit_for_bit(case) -> None:
     if rules.can_be_dirty:
         flags = state.flags.reshape(len(state.owner), -1)
         for s in range(8):
-            held = (state.flags[cache.DIRTY :: 4] >> s) & 1 == 1
+            held = (flags[:, cache.DIRTY] >> s) & 1 == 1
             dirty.update(state.owner[held, s].tolist())
     assert dirty == reference.dirty_sectors()
 
@@ -204,9 +211,11 @@ def compare_with_reference(reference, requests, sets, outcome) -> None:
             assert int(outcome.evicted_line[i]) == expected.evicted
 
 
-def line_misses(level: CacheLevel, lines: np.ndarray) -> int:
+def line_misses(level: CacheLevel, lines: np.ndarray, first_line: int | None = None) -> int:
     """Misses of whole-line loads, all in set 0 of one instance."""
-    rules = cache.cache_rules(level, 1, bypass_loads=False, bypass_stores=True)
+    rules = cache.cache_rules(
+        level, 1, bypass_loads=False, bypass_stores=True, first_line=first_line
+    )
     counters = np.zeros((1, cache.NUM_COUNTERS), np.int64)
     requests = requests_of(lines)
     sets = np.zeros(len(lines), np.uint32)
@@ -221,19 +230,25 @@ def line_misses(level: CacheLevel, lines: np.ndarray) -> int:
     return int(counters[0, cache.LINE_MISSES])
 
 
-@pytest.mark.parametrize("ways", [1, 4, 12, 96])
-def test_ways_plus_one_lines_in_a_circle_all_miss_under_lru_and_fifo(ways: int) -> None:
+FIRST_LINES = pytest.mark.parametrize("first_line", [None, 0], ids=["hashed", "small sets"])
+
+
+@FIRST_LINES
+@pytest.mark.parametrize("ways", [1, 4, 12, 16, 96])
+def test_ways_plus_one_lines_in_a_circle_all_miss_under_lru_and_fifo(ways, first_line) -> None:
     circle = np.tile(np.arange(ways + 1), 5)
     for policy in ("lru", "fifo"):
-        assert line_misses(level_of(1, ways, replacement=policy), circle) == len(circle)
+        level = level_of(1, ways, replacement=policy)
+        assert line_misses(level, circle, first_line) == len(circle)
 
 
 @pytest.mark.parametrize("policy", POLICIES)
 @pytest.mark.parametrize("ways", [1, 3, 16, 48])
-def test_a_working_set_that_fits_has_only_compulsory_misses(policy: str, ways: int) -> None:
+@FIRST_LINES
+def test_a_working_set_that_fits_has_only_compulsory_misses(policy, ways, first_line) -> None:
     lines = np.random.default_rng(1).integers(0, ways, 500)
     level = level_of(1, ways, replacement=policy)
-    assert line_misses(level, lines) == len(np.unique(lines))
+    assert line_misses(level, lines, first_line) == len(np.unique(lines))
 
 
 @pytest.mark.parametrize(
@@ -251,10 +266,11 @@ def test_a_working_set_that_fits_has_only_compulsory_misses(policy: str, ways: i
         ("srrip", [0, 1, 2, 3, 0, 4, 0], True),
     ],
 )
-def test_the_victim_is_the_policys(policy: str, stream: list[int], last_hits: bool) -> None:
+@FIRST_LINES
+def test_the_victim_is_the_policys(policy, stream, last_hits, first_line) -> None:
     level = level_of(1, 4, replacement=policy)
-    before = line_misses(level, np.array(stream[:-1]))
-    assert line_misses(level, np.array(stream)) - before == (not last_hits)
+    before = line_misses(level, np.array(stream[:-1]), first_line)
+    assert line_misses(level, np.array(stream), first_line) - before == (not last_hits)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -276,11 +292,14 @@ def test_sets_are_independent(seed: int) -> None:
     assert misses(np.argsort(sets, kind="stable")) == misses(np.arange(600))
 
 
-def test_reset_forgets_everything() -> None:
+@FIRST_LINES
+def test_reset_forgets_everything(first_line: int | None) -> None:
     level = level_of(
         4, 3, replacement="lru", write_policy="write-back", write_allocate="fetch-on-write"
     )
-    rules = cache.cache_rules(level, 2, bypass_loads=False, bypass_stores=False)
+    rules = cache.cache_rules(
+        level, 2, bypass_loads=False, bypass_stores=False, first_line=first_line
+    )
     lines = np.random.default_rng(2).integers(0, 40, 300)
     batch = requests_of(lines, operation=np.arange(300) % 2)
     sets = (lines % 4).astype(np.uint32)
