@@ -19,31 +19,29 @@ _MAX_TABLE_LINES = 1 << 23
 
 
 @njit(cache=True, nogil=True, _nrt=False)
-def _locate_in_slices(  # type: ignore[no-untyped-def]
-    line, count, line_bytes, partition, set_kind, num_sets, set_table, where, sets, per_slice
-):
-    """Slice and set in the slice of each line; per_slice: (num_slices,) int64, how many lines each slice got."""
+def _locate_in_slices(line, count, line_bytes, partition, set_hash, sets):  # type: ignore[no-untyped-def]
+    """Set of each line among the sets of all slices, slice by slice."""
     line_shift = _U64(0)
     while (_U64(1) << line_shift) < _U64(line_bytes):
         line_shift += _U64(1)
     channels, per_channel = _U64(partition.num_channels), _U64(partition.slices_per_channel)
     run_shift, xor = _U64(partition.run_shift), partition.xor
     kind, slices, table = partition.hash.kind, partition.hash.size, partition.hash.table
+    set_kind, num_sets, set_table = set_hash.kind, set_hash.size, set_hash.table
     for i in range(_U64(count)):
-        chosen, number = slice_and_line(
-            line[i] << line_shift,
-            channels,
-            per_channel,
-            run_shift,
-            kind,
-            slices,
-            table,
-            xor,
-            line_shift,
+        where, number = slice_and_line(
+            line[i] << line_shift, channels, per_channel, run_shift, kind, slices, table, xor, line_shift
         )
-        where[i] = chosen
-        sets[i] = index_of(number, set_kind, num_sets, set_table)
-        per_slice[chosen] += 1
+        sets[i] = where * _U64(num_sets) + index_of(number, set_kind, num_sets, set_table)
+
+
+@njit(cache=True, nogil=True, _nrt=False)
+def _split_by_slice(sets, count, num_sets, where, per_slice):  # type: ignore[no-untyped-def]
+    """Slice and set in the slice of each set among all; per_slice: (num_slices,) int64, how many lines each slice got."""
+    for i in range(_U64(count)):
+        where[i] = sets[i] // _U32(num_sets)
+        sets[i] -= where[i] * _U32(num_sets)
+        per_slice[where[i]] += 1
 
 
 @njit(cache=True, nogil=True, _nrt=False)
@@ -132,7 +130,6 @@ class Level:
             lines is not None
             and lines[1] <= _MAX_TABLE_LINES
             and self.num_slices > 1
-            and not self.by_slice
         ):
             self._tabulate(*lines)
         self.state = cache.empty_state(self.rules)
@@ -143,21 +140,16 @@ class Level:
     ) -> tuple[Requests, npt.NDArray[np.uint32]]:
         """The requests in the order in which they are worked off, and the set of each in its instance."""
         count = requests.num_requests
-        if len(self._set_of_line):
-            assert self.num_distinct is not None
+        if self.num_distinct is not None:
             self.num_distinct += _look_up_sets(
                 requests.line, requests.mask, count, self._first_line, self._set_of_line, self._seen, buffer.sets
             )  # fmt: skip
-            return requests, buffer.sets
+        else:
+            self._locate(requests.line, count, buffer.sets)
         if not self.by_slice:
-            self._locate(requests.line, count, buffer.where, buffer.sets)
             return requests, buffer.sets
-        h = self.hash
         per_slice = np.zeros(self.num_slices, np.int64)
-        _locate_in_slices(
-            requests.line, count, self.config.line_bytes, self.partition, h.kind, h.size, h.table,
-            buffer.where, buffer.sets, per_slice,
-        )  # fmt: skip
+        _split_by_slice(buffer.sets, count, self.hash.size, buffer.where, per_slice)
         segments = np.concatenate([[0], np.cumsum(per_slice)])
         out = buffer.by_slice
         assert out is not None
@@ -175,28 +167,20 @@ class Level:
         return arranged, buffer.sets_by_slice
 
     def _locate(
-        self,
-        line: npt.NDArray[np.uint64],
-        count: int,
-        where: npt.NDArray[np.uint32],
-        sets: npt.NDArray[np.uint32],
+        self, line: npt.NDArray[np.uint64], count: int, sets: npt.NDArray[np.uint32]
     ) -> None:
-        """Set of each line, among the sets of all slices where the level is sliced. where: scratch of as many."""
+        """Set of each line, among the sets of all slices where the level is sliced."""
         h = self.hash
         if self.partition is None:
             set_indices(line, count, h.kind, h.size, h.table, sets)
-            return
-        per_slice = np.zeros(self.num_slices, np.int64)
-        _locate_in_slices(
-            line, count, self.config.line_bytes, self.partition, h.kind, h.size, h.table, where, sets, per_slice
-        )  # fmt: skip
-        sets[:count] += where[:count] * _U32(h.size)
+        else:
+            _locate_in_slices(line, count, self.config.line_bytes, self.partition, h, sets)
 
     def _tabulate(self, first_line: int, count: int) -> None:
         line = np.arange(count, dtype=np.uint64) + _U64(first_line)
         self._first_line, self._set_of_line = first_line, np.empty(count, np.uint32)
         self._seen, self.num_distinct = np.zeros(count, np.uint8), 0
-        self._locate(line, count, np.empty(count, np.uint32), self._set_of_line)
+        self._locate(line, count, self._set_of_line)
 
     def access(self, requests: Requests, sets: npt.NDArray[np.uint32], outcome: Outcome) -> None:
         """Count a batch; fills `outcome`, request by request in the order given."""
@@ -230,7 +214,7 @@ class Buffer:
         self.sets = np.empty(num_requests, np.uint32)
         self.position = np.empty(num_requests, np.int64)
         self.outcome = cache.empty_outcome(level.rules, num_requests)
-        self.where = np.empty(num_requests if level.partition is not None else 0, np.uint32)
+        self.where = np.empty(num_requests if level.by_slice else 0, np.uint32)
         self.by_slice = _room(num_requests, 0, 0) if level.by_slice else None
         self.sets_by_slice = np.empty(num_requests if level.by_slice else 0, np.uint32)
 

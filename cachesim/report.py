@@ -128,7 +128,7 @@ class Report:
 
     gpu: preset name. trace: identification of the trace. counters: by level, from the SM down. parts: None for a trace without
     provenance. num_rows: warp instructions issued. distinct_sectors: of the sliced levels, which are never emptied, how many
-    different sectors were asked (compulsory misses); levels for which it was not counted are absent. cycles, time_ms: None without timing. timings: host seconds per stage.
+    different sectors were asked (compulsory misses); levels where it was not counted, or that something went around, are absent. cycles, time_ms: None without timing. timings: host seconds per stage.
     """
 
     gpu: str
@@ -202,6 +202,12 @@ class Report:
                 sum(p.dram.bytes for p in self.parts),
             )
 
+    def level_json(self, level: str) -> dict[str, Any]:
+        """A level's entry: its counters, and `distinct_sectors`, None where they were not counted."""
+        return self.counters[level].to_json() | {
+            "distinct_sectors": self.distinct_sectors.get(level)
+        }
+
     def to_json(self) -> dict[str, Any]:
         """The report of the design's contract, JSON-able."""
         by = None
@@ -223,10 +229,7 @@ class Report:
             "fetch_path": self.fetch_path,
             "layout": self.layout,
             "levels": list(self.levels),
-            **{
-                name: c.to_json() | {"distinct_sectors": self.distinct_sectors.get(name)}
-                for name, c in self.counters.items()
-            },
+            **{name: self.level_json(name) for name in self.levels},
             "dram": self.dram.to_json(),
             "demand": self.demand,
             "warp_instructions": self.num_rows,
@@ -238,10 +241,10 @@ class Report:
     def frame(self) -> pd.DataFrame:
         """One row per level: the counters, `misses`, `miss_rate` and `demand_bytes`."""
         rows = [
-            {"level": n, **c.to_json(), "demand_bytes": c.demand_bytes}
+            {"level": n, **self.level_json(n), "demand_bytes": c.demand_bytes}
             for n, c in self.counters.items()
         ]
-        return pd.DataFrame(rows).astype({"miss_rate": float})
+        return pd.DataFrame(rows).astype({"miss_rate": float, "distinct_sectors": "Int64"})
 
     def by_frame(self) -> pd.DataFrame:
         """One row per pass x texture x mip x level; DRAM is a level of its own with `bytes`. Empty without provenance."""

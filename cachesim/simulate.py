@@ -208,7 +208,8 @@ class _Model:
             distinct_sectors={
                 level.name: level.num_distinct
                 for level in levels
-                if level.num_distinct is not None and not level.rules.bypass_loads
+                if level.num_distinct is not None
+                and not level.counters[:, cache.BYPASSES].any()
             },
             timings=dict(hierarchy.timings),
         )

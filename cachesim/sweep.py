@@ -119,7 +119,7 @@ def grid(gpu: Gpu | str, axes: Mapping[str, Sequence[Any]]) -> list[tuple[Row, G
 def flat_counters(report: Report) -> Row:
     """A report as one row: "l1.accesses" and so on for all levels, then "dram.*" and "demand.*"."""
     sections: dict[str, Mapping[str, Any]] = {
-        **{name: counters.to_json() for name, counters in report.counters.items()},
+        **{name: report.level_json(name) for name in report.levels},
         "dram": report.dram.to_json(),
         "demand": report.demand,
     }
