@@ -120,7 +120,7 @@ class CacheLevel(_Model):
 class L1(CacheLevel):
     """The first level of an SM (RDNA: the L0 of a CU).
 
-    units_per_sm: independent cache units; a warp uses unit (its slot in the SM) mod units_per_sm.
+    units_per_sm: independent cache units; a warp uses unit (its slot in the SM / 2) mod units_per_sm.
     bypass_loads: whether plain global loads skip this level (fetch path "global").
     """
 

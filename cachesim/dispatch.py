@@ -3,6 +3,9 @@
 Time is turns: in each turn every SM, in index order, issues the next access of its next resident warp, round robin. A CTA leaves
 after its last access, and the next CTA in order takes its place. At a launch's start CTAs are placed one per SM in turn. The order
 depends on the numbers of accesses alone, never on hits, nor on how the trace was cut into chunks.
+
+Where an SM has several L1 units, pairs of warp slots take them in turn: warps go to the four schedulers in turn, and a pair of
+schedulers shares a unit (Maxwell and Pascal).
 """
 
 from __future__ import annotations
@@ -141,7 +144,7 @@ def _issue(  # type: ignore[no-untyped-def]
                 continue
             idle = False
             out_slot[n] = next_row[sm, slot] & mask
-            out_instance[n] = sm * units + slot % units
+            out_instance[n] = sm * units + (slot // 2) % units
             n += 1
             next_row[sm, slot] += 1
             rows_left[sm, slot] -= 1

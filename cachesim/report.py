@@ -165,7 +165,16 @@ class Report:
         for name in names:
             c = self.counters[name]
             _law(f"{name}: accesses = hits + misses", c.accesses, c.hits + c.misses)
-            _law(f"{name}: 0 <= write_misses <= writes", True, 0 <= c.write_misses <= c.writes)
+            for part, whole in (
+                ("write_misses", "writes"),
+                ("stores_down", "writes"),
+                ("write_fills", "writes"),
+                ("bypassed_writes", "bypasses"),
+            ):
+                holds = 0 <= getattr(c, part) <= getattr(c, whole)
+                _law(f"{name}: 0 <= {part} <= {whole}", True, holds)
+            held = c.writebacks + c.dirty_at_end
+            _law(f"{name}: writebacks + dirty_at_end <= writes", True, held <= c.writes)
         for upper, lower in zip(names, names[1:], strict=False):
             u, d = self.counters[upper], self.counters[lower]
             passed = (u.reads_down + u.writes_down) * u.sector_bytes
@@ -173,6 +182,11 @@ class Report:
                 f"{upper} passes down what {lower} is presented",
                 passed,
                 d.presented * d.sector_bytes,
+            )
+            _law(
+                f"{upper} writes what {lower} is presented to write",
+                u.writes_down * u.sector_bytes,
+                (d.writes + d.bypassed_writes) * d.sector_bytes,
             )
         for name, distinct in self.distinct_sectors.items():
             misses = self.counters[name].misses
@@ -182,8 +196,10 @@ class Report:
                 misses >= distinct,
             )
         last = self.counters[names[-1]]
-        moved = (last.reads_down + last.writes_down) * last.sector_bytes
-        _law(f"{names[-1]} passes down what DRAM moves", moved, self.dram.bytes)
+        moved = last.reads_down * last.sector_bytes, last.writes_down * last.sector_bytes
+        dram = self.dram
+        told = dram.sectors_read * dram.sector_bytes, dram.sectors_written * dram.sector_bytes
+        _law(f"{names[-1]} passes down what DRAM moves", moved, told)
         if self.parts is not None:
             for name in names:
                 total = sum(

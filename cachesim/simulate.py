@@ -84,7 +84,10 @@ def simulate_all(
                 list(pool.map(lambda m, c=chunk: m.add(c), models))
                 if progress is not None:
                     progress(models[0].num_lane_fetches)
-            return list(pool.map(_Model.finish, models))
+            reports = list(pool.map(_Model.finish, models))
+            if progress is not None:
+                progress(reports[0].lane_fetches)
+            return reports
     finally:
         for model in models:
             model.close()

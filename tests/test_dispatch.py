@@ -57,7 +57,7 @@ def expected_issue(counts: np.ndarray, num_sms: int, places: int, units: int) ->
             if slot is None:
                 continue
             cta, warp = resident[sm][slot // num_warps], slot % num_warps
-            issued.append((cta, warp, int(done[cta, warp]), sm * units + slot % units))
+            issued.append((cta, warp, int(done[cta, warp]), sm * units + slot // 2 % units))
             done[cta, warp] += 1
             turn_of[sm] = slot + 1
             if (done[cta] == counts[cta]).all():
