@@ -1,15 +1,16 @@
 """The loops of the cache: requests to hits, misses and what goes to the next level.
 
-Arrays of a tuple are counted references to numba, and every counted reference taken in a loop costs as much as a look-up: the hot
-loops take the arrays out first, and nothing here is compiled with counting.
+Arrays of a tuple are counted references to numba, and every counted reference taken in a loop costs
+as much as a look-up: the hot loops take the arrays out first, and nothing here is compiled with
+counting.
 """
 
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from cachesim import policies
+from cachesim.compiled import compiled, inlined
 from cachesim.counts import (
     ACCESSES,
     BYPASSED_WRITES,
@@ -49,9 +50,11 @@ from cachesim.stream import ATOMIC, GROUP_BITS, GROUP_MASK, LOAD, STORE
 U64, U32, U8 = np.uint64, np.uint32, np.uint8
 
 
-@njit(cache=True, nogil=True, _nrt=False)
+@compiled
 def _evict(state, rules, line, number, i, counters, outcome):  # type: ignore[no-untyped-def]
-    """Count and report the write-back of dirty line `number`; it belongs to the groups that dirtied its sectors."""
+    """Count and report the write-back of dirty line `number`; it belongs to the groups that dirtied
+    its sectors.
+    """
     at = U64(line) * U64(4)
     outcome.evicted_line[i] = number
     for s in range(rules.sectors_per_line):
@@ -64,9 +67,11 @@ def _evict(state, rules, line, number, i, counters, outcome):  # type: ignore[no
     state.flags[at + DIRTY] = 0
 
 
-@njit(cache=True, nogil=True, _nrt=False)
+@compiled
 def _store(state, rules, line, mask, group, operation, written, bytes_written):  # type: ignore[no-untyped-def]
-    """Put a store's or atomic's sectors into a present line. Returns (sectors passed down, sectors to fetch)."""
+    """Put a store's or atomic's sectors into a present line. Returns (sectors passed down, sectors
+    to fetch).
+    """
     flags, at = state.flags, U64(line) * U64(4)
     down, fill = U8(0), U8(0)
     for s in range(rules.sectors_per_line):
@@ -109,7 +114,7 @@ def _store(state, rules, line, mask, group, operation, written, bytes_written): 
     return down, fill
 
 
-@njit(cache=True, nogil=True, _nrt=False)
+@compiled
 def _other_request(  # type: ignore[no-untyped-def]
     state, rules, requests, i, first_bucket, shift, cache_set, counters, outcome
 ):
@@ -171,8 +176,8 @@ def _other_request(  # type: ignore[no-untyped-def]
             state.small_tags[line] = tag
         else:
             line = take_hashed(
-                state.tags, state.links, flags, state.rrpv, state.newest, state.fills, state.tree, state.bucket,
-                rules.policy, U64(rules.ways), bucket, first_bucket, shift, cache_set,
+                state.tags, state.links, flags, state.rrpv, state.newest, state.fills, state.tree,
+                state.bucket, rules.policy, U64(rules.ways), bucket, first_bucket, shift, cache_set,
             )  # fmt: skip
             old = state.tags[line * U64(3)]
             state.tags[line * U64(3)] = number
@@ -189,7 +194,7 @@ def _other_request(  # type: ignore[no-untyped-def]
     outcome.fill[i] = fill
 
 
-@njit(cache=True, nogil=True, _nrt=False, inline="always")
+@inlined
 def _add_loads(counters, meta, looked_up, asked, hits, line_misses):  # type: ignore[no-untyped-def]
     group = U64(meta & U32(GROUP_MASK))
     counters[group, REQUESTS] += looked_up
@@ -199,7 +204,7 @@ def _add_loads(counters, meta, looked_up, asked, hits, line_misses):  # type: ig
     counters[group, SECTOR_MISSES] += asked - hits - line_misses
 
 
-@njit(cache=True, nogil=True, _nrt=False)
+@compiled
 def access_hashed(state, rules, requests, sets, counters, outcome):  # type: ignore[no-untyped-def]
     """`cache.access` with hashed look-up."""
     tags, links, flags, rrpv = state.tags, state.links, state.flags, state.rrpv
@@ -244,8 +249,8 @@ def access_hashed(state, rules, requests, sets, counters, outcome):  # type: ign
                 flags[at + PARTIAL] &= ~mask
             else:
                 line = take_hashed(
-                    tags, links, flags, rrpv, newest, fills, tree, buckets, policy, ways, bucket, first_bucket, shift,
-                    cache_set,
+                    tags, links, flags, rrpv, newest, fills, tree, buckets, policy, ways, bucket,
+                    first_bucket, shift, cache_set,
                 )  # fmt: skip
                 at = line * U64(4)
                 if can_be_dirty and flags[at + DIRTY]:
@@ -257,7 +262,7 @@ def access_hashed(state, rules, requests, sets, counters, outcome):  # type: ign
         _add_loads(counters, run, looked_up, asked, hits, line_misses)
 
 
-@njit(cache=True, nogil=True, _nrt=False)
+@compiled
 def access_small(state, rules, requests, sets, counters, outcome, num_tags):  # type: ignore[no-untyped-def]
     """`cache.access` with small sets."""
     small_tags, recency, flags = state.small_tags, state.recency, state.flags

@@ -1,7 +1,8 @@
-"""From a line's address to its set and slice: the set hashes and partition hashes of the facts sheet, sections 3.2 to 3.4.
+"""From a line's address to its set and slice: the set hashes and partition hashes of the facts
+sheet, sections 3.2 to 3.4.
 
-Every hash here except division and "random" is linear over GF(2), so that it is a table look-up per address byte: the hash of a
-number is the XOR of the hashes of its bytes.
+Every hash here except division and "random" is linear over GF(2), so that it is a table look-up per
+address byte: the hash of a number is the XOR of the hashes of its bytes.
 """
 
 from __future__ import annotations
@@ -10,14 +11,15 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
+from cachesim.compiled import compiled, inlined
 from cachesim.config import L2, CacheLevel
 
 U64 = np.uint64
 
-# Primitive polynomials over GF(2) by degree, without the leading term. Degrees 4 to 6 are GPGPU-Sim's IPOLY (facts sheet 3.2,
-# verified there numerically); the others are the usual primitive ones, assumed for slice counts GPGPU-Sim has no table for.
+# Primitive polynomials over GF(2) by degree, without the leading term. Degrees 4 to 6 are GPGPU-
+# Sim's IPOLY (facts sheet 3.2, verified there numerically); the others are the usual primitive
+# ones, assumed for slice counts GPGPU-Sim has no table for.
 _POLYNOMIALS = {
     1: 0b1,
     2: 0b11,
@@ -28,7 +30,8 @@ _POLYNOMIALS = {
     7: 0b0000011,
     8: 0b00011101,
 }
-#: How many low bits of the block number IPOLY looks at (facts sheet 3.2: "up to" bit 16, 19, 24); 40 for the degrees GPGPU-Sim has no table for.
+#: How many low bits of the block number IPOLY looks at (facts sheet 3.2: "up to" bit 16, 19, 24);
+#: 40 for the degrees GPGPU-Sim has no table for.
 _IPOLY_BITS = {4: 17, 5: 20, 6: 25}
 
 _EXACT = np.uint64(1 << 52)
@@ -38,7 +41,8 @@ MASK, MODULO, TABLE, RANDOM = range(4)
 
 
 class IndexHash(NamedTuple):
-    """An index function on 64-bit numbers: kind, number of values, and the byte tables where it is GF(2)-linear.
+    """An index function on 64-bit numbers: kind, number of values, and the byte tables where it is
+    GF(2)-linear.
 
     table: (num_bytes, 256) uint32; empty unless kind is `TABLE`.
     """
@@ -49,7 +53,7 @@ class IndexHash(NamedTuple):
 
 
 def _table_of_columns(columns: list[int]) -> npt.NDArray[np.uint32]:
-    """The byte tables of a GF(2)-linear map; columns[k] is the hash of the number with bit k alone."""
+    """The byte tables of a GF(2)-linear map; columns[k] is the hash of bit k alone."""
     num_bytes = -(-len(columns) // 8)
     table = np.zeros((num_bytes, 256), np.uint32)
     for bit, column in enumerate(columns):
@@ -70,7 +74,7 @@ def ipoly_columns(degree: int) -> list[int]:
 
 
 def _fermi_columns(num_sets: int) -> list[int]:
-    """Facts sheet 3.2: line-number bits 0-4, XOR bits 6, 7, 8, 10, 12; bit 5 appended for 64 sets."""
+    """Facts sheet 3.2: line-number bits 0-4, XOR bits 6, 7, 8, 10, 12; bit 5 for 64 sets."""
     columns = [0] * 13
     for bit in range(5):
         columns[bit] = 1 << bit
@@ -104,8 +108,10 @@ def set_hash(level: CacheLevel) -> IndexHash:
 class Partition(NamedTuple):
     """How addresses spread over slices, and what is left of them inside a slice.
 
-    num_channels, slices_per_channel; run_shift: binary logarithm of the bytes in a row that one slice holds.
-    hash: index function on the run number ("random", "ipoly") or none where kind is `MASK`/`MODULO` (plain interleave);
+    num_channels, slices_per_channel; run_shift: binary logarithm of the bytes in a row that one
+    slice holds.
+    hash: index function on the run number ("random", "ipoly") or none where kind is `MASK`/`MODULO`
+        (plain interleave);
     xor: 1 where the channel is XORed with the bits above it.
     """
 
@@ -141,7 +147,7 @@ def partition_of(level: L2) -> Partition:
     )
 
 
-@njit(cache=True, nogil=True, _nrt=False, inline="always")
+@inlined
 def mix64(x):  # type: ignore[no-untyped-def]
     """A uniform 64-bit hash (splitmix64's finaliser)."""
     x = (x ^ (x >> U64(30))) * U64(0xBF58476D1CE4E5B9)
@@ -149,7 +155,7 @@ def mix64(x):  # type: ignore[no-untyped-def]
     return x ^ (x >> U64(31))
 
 
-@njit(cache=True, nogil=True, _nrt=False, inline="always")
+@inlined
 def index_of(number, kind, size, table):  # type: ignore[no-untyped-def]
     """The index in [0, size) of a 64-bit number under an `IndexHash`, as uint64."""
     if kind == MASK:
@@ -165,21 +171,23 @@ def index_of(number, kind, size, table):  # type: ignore[no-untyped-def]
     return U64(index) % U64(size) if size & (size - 1) else U64(index)
 
 
-@njit(cache=True, nogil=True, _nrt=False)
+@compiled
 def set_indices(line, count, kind, size, table, out):  # type: ignore[no-untyped-def]
     """Write the set index of line[:count] into out[:count] (uint32)."""
     for i in range(count):
         out[i] = index_of(line[i], kind, size, table)
 
 
-@njit(cache=True, nogil=True, _nrt=False, inline="always")
+@inlined
 def slice_and_line(  # type: ignore[no-untyped-def]
     address, channels, per_channel, run_shift, kind, slices, table, xor, line_shift
 ):
-    """(slice, line number inside the slice) of a byte address, both uint64. channels, per_channel: uint64.
+    """(slice, line number inside the slice) of a byte address, both uint64. channels, per_channel:
+    uint64.
 
-    run_shift, line_shift: uint64 binary logarithms of a slice's run and of a line.
-    The line number drops the channel and slice bits of the plain interleave, whatever the hash (facts sheet 3.4).
+    run_shift, line_shift: uint64 binary logarithms of a slice's run and of a line. The line number
+        drops the channel and slice bits of the plain interleave, whatever the hash (facts sheet
+        3.4).
     """
     run = address >> run_shift
     if per_channel == U64(1):

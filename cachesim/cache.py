@@ -1,7 +1,7 @@
 """The cache: a batch of requests in, hits and misses counted, what goes to the next level out.
 
-All instances of a level (units, arrays or slices) live in one set of flat arrays. `cachesim.lookup` finds lines in them,
-`cachesim.policies` chooses victims, `cachesim.access` holds the loops.
+All instances of a level (units, arrays or slices) live in one set of flat arrays. `cachesim.lookup`
+finds lines in them, `cachesim.policies` chooses victims, `cachesim.access` holds the loops.
 """
 
 from __future__ import annotations
@@ -60,17 +60,20 @@ _ON_MISS = {
 
 
 class CacheState(NamedTuple):
-    """The arrays of all instances of a level. L = lines in all, S = sets in all, B = hash buckets in all.
+    """The arrays of all instances of a level. L = lines in all, S = sets in all, B = hash buckets
+    in all.
 
-    flags: (4 L,) uint8, 4 l + `USED`, `VALID`, `PARTIAL`, `DIRTY`. bytes_held: (L, 8) uint32 bytes of each partial sector; owner:
-        (L, 8) int32 group that dirtied a sector.
-    Hashed: 24 bytes per line, in two views, so that what a miss needs of its victim comes with one fetch. tags: (3 L,) uint64,
-        3 l is the line number that line l holds. links: (6 L,) uint32, 6 l + `lookup.CHAIN` is the next line of its hash chain,
-        6 l + `policies.NEWER` and `OLDER` its set's ring. bucket: (B,) uint32 first line of a chain, `NO_LINE` = empty. newest:
-        (S,) uint32 a set's most recent line. fills: (S,) uint64 tags it was given. tree: (S,) uint64 tree-PLRU's bits. rrpv: (L,)
-        uint8 SRRIP's values. Empty where sets are small.
-    Small sets: every set has room for 16 lines. small_tags: (16 S,) uint32 line number less the first. recency: (S,) uint64, its
-        ways from the newest, lowest 4 bits, up. Empty where hashed.
+    flags: (4 L,) uint8, 4 l + `USED`, `VALID`, `PARTIAL`, `DIRTY`. bytes_held: (L, 8) uint32 bytes
+        of each partial sector; owner: (L, 8) int32 group that dirtied a sector.
+    Hashed: 24 bytes per line, in two views, so that what a miss needs of its victim comes with one
+        fetch. tags: (3 L,) uint64, 3 l is the line number that line l holds. links: (6 L,) uint32,
+        6 l + `lookup.CHAIN` is the next line of its hash chain, 6 l + `policies.NEWER` and `OLDER`
+        its set's ring. bucket: (B,) uint32 first line of a chain, `NO_LINE` = empty. newest: (S,)
+        uint32 a set's most recent line. fills: (S,) uint64 tags it was given. tree: (S,) uint64
+        tree-PLRU's bits. rrpv: (L,) uint8 SRRIP's values. Empty where sets are small.
+    Small sets: every set has room for 16 lines. small_tags: (16 S,) uint32 line number less the
+        first. recency: (S,) uint64, its ways from the newest, lowest 4 bits, up. Empty where
+        hashed.
     """
 
     flags: npt.NDArray[np.uint8]
@@ -88,7 +91,9 @@ class CacheState(NamedTuple):
 
 
 class CacheRules(NamedTuple):
-    """The scalars of a level that its loops need. small: whether it uses small sets, with line numbers from `first_line` up."""
+    """The scalars of a level that its loops need. small: whether it uses small sets, with line
+    numbers from `first_line` up.
+    """
 
     num_instances: int
     num_sets: int
@@ -115,7 +120,8 @@ def cache_rules(
 ) -> CacheRules:
     """The rules of `num_instances` caches like `level`.
 
-    first_line: given where all line numbers are known to lie in [first_line, first_line + 2^32 - 2]; lets sets be small.
+    first_line: given where all line numbers are known to lie in [first_line, first_line + 2^32 -
+        2]; lets sets be small.
     """
     on_hit = _ON_HIT[level.write_policy]
     small = (
@@ -143,7 +149,8 @@ def empty_state(rules: CacheRules) -> CacheState:
     sets = rules.num_instances * rules.num_sets
     lines = sets * (SMALL_WAYS if rules.small else rules.ways)
     hashed_lines, hashed_sets = (0, 0) if rules.small else (lines, sets)
-    # Eight buckets per line: a chain that is nearly always empty or of one line is a branch that the host predicts.
+    # Eight buckets per line: a chain that is nearly always empty or of one line is a branch that
+    # the host predicts.
     per_instance = rules.num_sets * rules.ways
     buckets = 1 << max(4, (8 * per_instance - 1).bit_length())
     stores = 0 if rules.bypass_stores else lines
@@ -211,8 +218,10 @@ def access(
 ) -> None:
     """Send requests to their cache instances, segment by segment.
 
-    requests: segments of one instance in issue order. sets: (n,) uint32, set of each request in its instance.
-    counters: (num_groups, NUM_COUNTERS) int64, added to. outcome: room for every request, filled in.
+    requests: segments of one instance in issue order. sets: (n,) uint32, set of each request in its
+        instance.
+    counters: (num_groups, NUM_COUNTERS) int64, added to. outcome: room for every request, filled
+        in.
     """
     if rules.small:
         access_small(state, rules, requests, sets, counters, outcome, np.uint64(SMALL_WAYS))

@@ -1,4 +1,5 @@
-"""Coalescing: the lanes of each issued row to requests, one per distinct line, with the mask of distinct sectors.
+"""Coalescing: the lanes of each issued row to requests, one per distinct line, with the mask of
+distinct sectors.
 
 Requests of a row are in ascending address order, whatever the order of its lanes.
 """
@@ -9,8 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
+from cachesim.compiled import compiled, inlined
 from cachesim.stream import GROUP_BITS, OPERATION_CODES, STORE
 from traces.footprint import texel_offset
 from traces.placement import AddressMap
@@ -23,7 +24,8 @@ U64, U32, U8 = np.uint64, np.uint32, np.uint8
 class Program(NamedTuple):
     """What coalescing needs to know of each instruction. I = number of instructions.
 
-    operation, bilinear: (I,) uint8; texture, access_bytes, group: (I,) int32; `group` is that of the texture's mip 0.
+    operation, bilinear: (I,) uint8; texture, access_bytes, group: (I,) int32; `group` is that of
+        the texture's mip 0.
     """
 
     operation: npt.NDArray[np.uint8]
@@ -34,7 +36,9 @@ class Program(NamedTuple):
 
 
 class Placement(NamedTuple):
-    """`AddressMap` as the loop wants it: addresses relative to the base, mip boundaries as well. T textures."""
+    """`AddressMap` as the loop wants it: addresses relative to the base, mip boundaries as well. T
+    textures.
+    """
 
     x_start: npt.NDArray[np.int64]
     y_start: npt.NDArray[np.int64]
@@ -48,7 +52,9 @@ class Placement(NamedTuple):
 
 
 def groups_of(trace: Trace) -> list[tuple[str, int]]:
-    """The (pass, texture) pairs of a trace's instructions, in order of first use; each has `MAX_MIPS` groups."""
+    """The (pass, texture) pairs of a trace's instructions, in order of first use; each has
+    `MAX_MIPS` groups.
+    """
     return list(dict.fromkeys((i.pass_name, i.texture) for i in trace.instructions))
 
 
@@ -98,13 +104,13 @@ def placement_of(address_map: AddressMap | None) -> Placement:
     )
 
 
-@njit(cache=True, nogil=True, _nrt=False, inline="always")
+@inlined
 def _address(x_tables, y_tables, x_start, y_start, base, low_mask, y, x):  # type: ignore[no-untyped-def]
     """Byte address of a texel of one level."""
     return base + U64(texel_offset(x_tables[x_start + x], y_tables[y_start + y], low_mask))
 
 
-@njit(cache=True, nogil=True, _nrt=False)
+@compiled
 def _texel_sectors(  # type: ignore[no-untyped-def]
     lanes, slot, texture, bilinear, place, shift, first, scratch, lane_fetches, group
 ):
@@ -156,9 +162,11 @@ def _texel_sectors(  # type: ignore[no-untyped-def]
     return np.int64(n)
 
 
-@njit(cache=True, nogil=True, _nrt=False)
+@compiled
 def _address_sectors(lanes, slot, access_bytes, shift, scratch, lane_fetches, group):  # type: ignore[no-untyped-def]
-    """Sectors of a row's byte addresses; an access over a sector's end has two. Returns how many keys."""
+    """Sectors of a row's byte addresses; an access over a sector's end has two. Returns how many
+    keys.
+    """
     keys = scratch.keys
     n = U64(0)
     for lane in range(lanes.shape[1]):
@@ -175,15 +183,17 @@ def _address_sectors(lanes, slot, access_bytes, shift, scratch, lane_fetches, gr
     return np.int64(n)
 
 
-@njit(cache=True, nogil=True, _nrt=False)
+@compiled
 def _sort_distinct(scratch, n):  # type: ignore[no-untyped-def]
-    """Each key to ranked[number of smaller keys], and how often it occurs to weight there: sorted, with gaps after repeats.
+    """Each key to ranked[number of smaller keys], and how often it occurs to weight there: sorted,
+    with gaps after repeats.
 
     Comparing all pairs is branch-free and vectorises; at 32 keys it beats a sort.
     """
     keys, rank, ranked, weight = scratch.keys, scratch.rank, scratch.ranked, scratch.weight
-    # Whole vectors, of a length that the compiler does not know (else it unrolls instead of vectorising), and four keys at a
-    # time, because a rank that was just written is slow to read. The largest key of all is below none.
+    # Whole vectors, of a length that the compiler does not know (else it unrolls instead of
+    # vectorising), and four keys at a time, because a rank that was just written is slow to read.
+    # The largest key of all is below none.
     padded = (n + U64(15)) & ~U64(15)
     for k in range(n, padded):
         keys[k] = ~keys.dtype.type(0)
@@ -200,7 +210,7 @@ def _sort_distinct(scratch, n):  # type: ignore[no-untyped-def]
         weight[rank[k]] += U32(1)
 
 
-@njit(cache=True, nogil=True, _nrt=False)
+@compiled
 def _store_bytes(  # type: ignore[no-untyped-def]
     lanes, slot, texture, access_bytes, place, sector_shift, line_shift, begin, end, requests
 ):
@@ -257,7 +267,7 @@ def new_scratch(warp_size: int, key_dtype: npt.DTypeLike) -> Scratch:
     return Scratch(keys, np.zeros(room, np.uint32), ranked, np.zeros(room, np.uint32))
 
 
-@njit(cache=True, nogil=True, _nrt=False)
+@compiled
 def coalesce(  # type: ignore[no-untyped-def]
     slots,
     lanes,
@@ -273,8 +283,10 @@ def coalesce(  # type: ignore[no-untyped-def]
 ):
     """Coalesce the rows at `slots` of the store, in that order, into `requests`, a segment each.
 
-    lanes: (capacity, warp_size) packed texels or addresses. first: uint64 subtracted from texels' sectors so that the scratch's
-    keys hold them. lane_fetches: (num_groups,) int64, added to. Returns -1, or the slot of a row with a texel outside its texture.
+    lanes: (capacity, warp_size) packed texels or addresses. first: uint64 subtracted from texels'
+        sectors so that the scratch's
+    keys hold them. lane_fetches: (num_groups,) int64, added to. Returns -1, or the slot of a row
+        with a texel outside its texture.
     """
     sector_in_line = (U64(1) << (line_shift - sector_shift)) - U64(1)
     to_line = line_shift - sector_shift

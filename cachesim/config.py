@@ -39,6 +39,7 @@ WritePolicy = Literal["read-only", "write-through", "write-back", "write-evict",
 WriteAllocate = Literal["none", "write-allocate", "fetch-on-write", "lazy-fetch-on-read"]
 FetchPath = Literal["texture", "readonly", "global"]
 MAX_SECTORS_PER_LINE = 8
+MAX_LINE_BYTES = 4096
 MAX_IPOLY_SLICES = 256
 
 
@@ -84,9 +85,11 @@ class CacheLevel(_Model):
     def _geometry_fits(self) -> Self:
         for field in ("line_bytes", "sector_bytes"):
             value = getattr(self, field)
-            if value & (value - 1) or not 16 <= value <= 4096:
+            if value & (value - 1) or not 16 <= value <= MAX_LINE_BYTES:
                 # A texel has up to 16 bytes; smaller sectors would split it.
-                raise ValueError(f"{field} = {value}: allowed are powers of two from 16 to 4096")
+                raise ValueError(
+                    f"{field} = {value}: allowed are powers of two from 16 to {MAX_LINE_BYTES}"
+                )
         if self.line_bytes % self.sector_bytes:
             raise ValueError(
                 f"sector_bytes = {self.sector_bytes} does not divide line_bytes = {self.line_bytes}"
@@ -120,7 +123,8 @@ class CacheLevel(_Model):
 class L1(CacheLevel):
     """The first level of an SM (RDNA: the L0 of a CU).
 
-    units_per_sm: independent cache units; a warp uses unit (its slot in the SM / 2) mod units_per_sm.
+    units_per_sm: independent cache units; a warp uses unit (its slot in the SM / 2) mod
+        units_per_sm.
     bypass_loads: whether plain global loads skip this level (fetch path "global").
     """
 

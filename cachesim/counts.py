@@ -25,8 +25,8 @@ NUM_COUNTERS = 12
 HIT_THROUGH, HIT_BACK, HIT_EVICT = range(3)
 MISS_NONE, MISS_ALLOCATE, MISS_FETCH, MISS_LAZY = range(4)
 
-# Places in a line's four flag bytes: whether it holds a tag, its readable sectors, those written in part and not readable, those
-# to write back.
+# Places in a line's four flag bytes: whether it holds a tag, its readable sectors, those written in
+# part and not readable, those to write back.
 USED, VALID, PARTIAL, DIRTY = np.uint64(0), np.uint64(1), np.uint64(2), np.uint64(3)
 
 POPCOUNT = np.array([bin(m).count("1") for m in range(256)], np.int64)

@@ -1,11 +1,13 @@
-"""CTA dispatch: which warp's access issues when, on which SM, without a clock (`Order when counting`).
+"""CTA dispatch: which warp's access issues when, on which SM, without a clock (`Order when
+counting`).
 
-Time is turns: in each turn every SM, in index order, issues the next access of its next resident warp, round robin. A CTA leaves
-after its last access, and the next CTA in order takes its place. At a launch's start CTAs are placed one per SM in turn. The order
-depends on the numbers of accesses alone, never on hits, nor on how the trace was cut into chunks.
+Time is turns: in each turn every SM, in index order, issues the next access of its next resident
+    warp, round robin. A CTA leaves after its last access, and the next CTA in order takes its
+    place. At a launch's start CTAs are placed one per SM in turn. The order depends on the numbers
+    of accesses alone, never on hits, nor on how the trace was cut into chunks.
 
-Where an SM has several L1 units, pairs of warp slots take them in turn: warps go to the four schedulers in turn, and a pair of
-schedulers shares a unit (Maxwell and Pascal).
+Where an SM has several L1 units, pairs of warp slots take them in turn: warps go to the four
+schedulers in turn, and a pair of schedulers shares a unit (Maxwell and Pascal).
 """
 
 from __future__ import annotations
@@ -16,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
+from cachesim.compiled import inlined
 from cachesim.config import SM
 from traces.errors import InputError
 from traces.trace import Chunk, Launch
@@ -26,8 +29,10 @@ I64 = np.int64
 class IssuedRows(NamedTuple):
     """A batch of rows in issue order.
 
-    slot: (n,) int64, where each row lies in `lanes` and `instruction`. instance: (n,) uint32, the L1 unit it goes to.
-    lanes: (capacity, warp_size), instruction: (capacity,) uint16, the dispatcher's store; valid until its next `issue`.
+    slot: (n,) int64, where each row lies in `lanes` and `instruction`. instance: (n,) uint32, the
+        L1 unit it goes to.
+    lanes: (capacity, warp_size), instruction: (capacity,) uint16, the dispatcher's store; valid
+        until its next `issue`.
     """
 
     slot: npt.NDArray[np.int64]
@@ -37,7 +42,8 @@ class IssuedRows(NamedTuple):
 
 
 def resident_ctas(sm: SM, launch: Launch) -> int:
-    """How many CTAs of a launch one SM holds at a time: the least of its CTA, warp, register and shared-memory limits.
+    """How many CTAs of a launch one SM holds at a time: the least of its CTA, warp, register and
+    shared-memory limits.
 
     Raises:
         InputError: a single CTA does not fit.
@@ -50,17 +56,18 @@ def resident_ctas(sm: SM, launch: Launch) -> int:
         limits.append(sm.shared // launch.shared_bytes_per_cta)
     if min(limits) < 1:
         raise InputError(
-            f"launch {launch.pass_name!r}: a CTA of {warps} warps, {launch.registers_per_thread} registers per thread and "
-            f"{launch.shared_bytes_per_cta} B of shared memory does not fit an SM of {sm.max_warps} warps, {sm.registers} "
-            f"registers and {sm.shared} B"
+            f"launch {launch.pass_name!r}: a CTA of {warps} warps, "
+            f"{launch.registers_per_thread} registers per thread and "
+            f"{launch.shared_bytes_per_cta} B of shared memory does not fit an SM of "
+            f"{sm.max_warps} warps, {sm.registers} registers and {sm.shared} B"
         )
     return min(limits)
 
 
-@njit(cache=True, nogil=True, inline="always")
-def _place(
+@inlined
+def _place(  # type: ignore[no-untyped-def]
     sm, place, warps_per_cta, queue, warp_first, warp_rows, next_row, rows_left, warps_left, cta_at
-):  # type: ignore[no-untyped-def]
+):
     """Put the next CTA of the queue on place `place` of an SM."""
     cta = queue[0]
     queue[0] = cta + 1
@@ -75,7 +82,7 @@ def _place(
 
 
 @njit(cache=True, nogil=True)
-def _fill_first(
+def _fill_first(  # type: ignore[no-untyped-def]
     warps_per_cta,
     num_places,
     queue,
@@ -86,7 +93,7 @@ def _fill_first(
     rows_left,
     warps_left,
     cta_at,
-):  # type: ignore[no-untyped-def]
+):
     """Place CTAs one per SM in turn until all SMs are full."""
     for place in range(num_places):
         for sm in range(next_row.shape[0]):
@@ -124,7 +131,9 @@ def _issue(  # type: ignore[no-untyped-def]
     out_slot,
     out_instance,
 ):
-    """Run whole turns until the output is full, the queue could run dry within a turn, or all is issued. Returns rows issued."""
+    """Run whole turns until the output is full, the queue could run dry within a turn, or all is
+    issued. Returns rows issued.
+    """
     num_sms, num_slots = next_row.shape
     n = 0
     idle = False
@@ -171,9 +180,11 @@ def _issue(  # type: ignore[no-untyped-def]
 
 
 class Dispatcher:
-    """Holds the rows of resident and waiting CTAs of one launch at a time, and hands them out in issue order.
+    """Holds the rows of resident and waiting CTAs of one launch at a time, and hands them out in
+    issue order.
 
-    The store is a ring of rows; it grows to what the resident CTAs need and is reused by every launch.
+    The store is a ring of rows; it grows to what the resident CTAs need and is reused by every
+    launch.
     """
 
     def __init__(
@@ -310,9 +321,9 @@ class Dispatcher:
 
 
 @njit(cache=True, nogil=True)
-def _join(
+def _join(  # type: ignore[no-untyped-def]
     offsets, lanes, instruction, warps_per_cta, inactive, out_offsets, out_lanes, out_instruction
-):  # type: ignore[no-untyped-def]
+):
     n, out_warp = 0, 0
     for first in range(0, len(offsets) - 1, warps_per_cta):
         for w in range(0, warps_per_cta, 2):
@@ -343,7 +354,8 @@ def join_warps(
 ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.uint32], npt.NDArray[np.uint16]]:
     """Two 32-lane warps of a CTA as one 64-lane wave: rows of the same instruction issue together.
 
-    Where the halves differ (one has more samples), the half that is earlier in the program issues alone, as after a divergent loop.
+    Where the halves differ (one has more samples), the half that is earlier in the program issues
+    alone, as after a divergent loop.
     """
     waves = -(-warps_per_cta // 2)
     ctas = (len(offsets) - 1) // warps_per_cta

@@ -2,7 +2,8 @@
 
     issued rows ──► coalesce ──► L1 units ──► (GL1 arrays) ──► L2 slices ──► (LLC slices) ──► DRAM
 
-Stages work on bounded batches and run side by side in threads: one coalesces, one runs the L1s, one all that is below.
+Stages work on bounded batches and run side by side in threads: one coalesces, one runs the L1s, one
+all that is below.
 """
 
 from __future__ import annotations
@@ -26,7 +27,8 @@ from cachesim.stream import GROUP_BITS, STORE, Requests
 from traces.errors import InputError
 from traces.texture import unpack_texel
 
-#: Rows of a batch: long enough that each L1 unit's state is fetched into the host's cache once for many rows.
+#: Rows of a batch: long enough that each L1 unit's state is fetched into the host's cache once for
+#: many rows.
 BATCH_ROWS = 8192
 _NUM_BATCHES = 3
 _U64 = np.uint64
@@ -34,7 +36,9 @@ _U64 = np.uint64
 
 @njit(cache=True, nogil=True)
 def _segments_of_positions(position, count, instance_of, out_segments, out_instance):  # type: ignore[no-untyped-def]
-    """Runs of requests from the same upper segment, and the lower instance of each. Returns how many runs."""
+    """Runs of requests from the same upper segment, and the lower instance of each. Returns how
+    many runs.
+    """
     runs = 0
     for i in range(count):
         if i == 0 or position[i] != position[i - 1]:
@@ -56,7 +60,8 @@ class _Batch:
 class Hierarchy:
     """The levels of one GPU, and the stages between them.
 
-    levels: from the L1 down. units_per_instance: L1 units behind each instance of each level (1 for the L1, all for a sliced level).
+    levels: from the L1 down. units_per_instance: L1 units behind each instance of each level (1 for
+        the L1, all for a sliced level).
     """
 
     def __init__(
@@ -126,7 +131,9 @@ class Hierarchy:
             pool.shutdown(wait=True, cancel_futures=True)
 
     def end_launch(self) -> None:
-        """L1s (and GL1s) start empty at each launch: write back what is dirty, forget the rest; sliced levels are kept."""
+        """L1s (and GL1s) start empty at each launch: write back what is dirty, forget the rest;
+        sliced levels are kept.
+        """
         self.drain()
         top = self.levels[0]
         if top.rules.can_be_dirty and top.state.flags[cache.DIRTY :: 4].any():
@@ -186,8 +193,9 @@ class Hierarchy:
         outside = (x >= width[mip % len(width)]) | (y >= height[mip % len(width)])
         lane = int(np.argmax(outside & (rows.lanes[slot] != np.uint32(0xFFFFFFFF))))
         return (
-            f"trace: a fetch of texture {texture} asks for texel (mip {mip[lane]}, y {y[lane]}, x {x[lane]}); it has "
-            f"{int((width > 0).sum())} mips, mip 0 of {width[0]}x{height[0]} texels"
+            f"trace: a fetch of texture {texture} asks for texel (mip {mip[lane]}, y {y[lane]}, "
+            f"x {x[lane]}); it has {int((width > 0).sum())} mips, mip 0 of "
+            f"{width[0]}x{height[0]} texels"
         )
 
     def _first_level(self, batch: _Batch) -> None:

@@ -1,24 +1,27 @@
-"""One level of the hierarchy: its caches, and how a request finds the instance and the set that it belongs to."""
+"""One level of the hierarchy: its caches, and how a request finds the instance and the set that it
+belongs to.
+"""
 
 from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
 from cachesim import cache
 from cachesim.address import index_of, partition_of, set_hash, set_indices, slice_and_line
-from cachesim.config import L2, CacheLevel
+from cachesim.compiled import compiled
+from cachesim.config import L2, MAX_LINE_BYTES, CacheLevel
 from cachesim.counts import POPCOUNT
 from cachesim.stream import GROUP_BITS, STORE, Outcome, Requests
 
 _U64, _U32 = np.uint64, np.uint32
 
-#: Up to this many lines, a table holds the set of each, which is cheaper than to hash its address again and again.
+#: Up to this many lines, a table holds the set of each, which is cheaper than to hash its address
+#: again and again.
 _MAX_TABLE_LINES = 1 << 23
 
 
-@njit(cache=True, nogil=True, _nrt=False)
+@compiled
 def _locate_in_slices(line, count, line_bytes, partition, set_hash, sets):  # type: ignore[no-untyped-def]
     """Set of each line among the sets of all slices, slice by slice."""
     line_shift = _U64(0)
@@ -30,23 +33,35 @@ def _locate_in_slices(line, count, line_bytes, partition, set_hash, sets):  # ty
     set_kind, num_sets, set_table = set_hash.kind, set_hash.size, set_hash.table
     for i in range(_U64(count)):
         where, number = slice_and_line(
-            line[i] << line_shift, channels, per_channel, run_shift, kind, slices, table, xor, line_shift
+            line[i] << line_shift,
+            channels,
+            per_channel,
+            run_shift,
+            kind,
+            slices,
+            table,
+            xor,
+            line_shift,
         )
         sets[i] = where * _U64(num_sets) + index_of(number, set_kind, num_sets, set_table)
 
 
-@njit(cache=True, nogil=True, _nrt=False)
+@compiled
 def _split_by_slice(sets, count, num_sets, where, per_slice):  # type: ignore[no-untyped-def]
-    """Slice and set in the slice of each set among all; per_slice: (num_slices,) int64, how many lines each slice got."""
+    """Slice and set in the slice of each set among all; per_slice: (num_slices,) int64, how many
+    lines each slice got.
+    """
     for i in range(_U64(count)):
         where[i] = sets[i] // _U32(num_sets)
         sets[i] -= where[i] * _U32(num_sets)
         per_slice[where[i]] += 1
 
 
-@njit(cache=True, nogil=True, _nrt=False)
+@compiled
 def _look_up_sets(line, mask, count, first_line, table, seen, sets):  # type: ignore[no-untyped-def]
-    """Set of each line from the table of `Level`; returns how many sectors were asked for the first time."""
+    """Set of each line from the table of `Level`; returns how many sectors were asked for the first
+    time.
+    """
     first, new = _U64(first_line), 0
     for i in range(_U64(count)):
         at = line[i] - first
@@ -56,7 +71,7 @@ def _look_up_sets(line, mask, count, first_line, table, seen, sets):  # type: ig
     return new
 
 
-@njit(cache=True, nogil=True, _nrt=False)
+@compiled
 def _sort_by_slice(  # type: ignore[no-untyped-def]
     line,
     mask,
@@ -72,7 +87,9 @@ def _sort_by_slice(  # type: ignore[no-untyped-def]
     out_written,
     out_sets,
 ):
-    """Requests slice by slice, each slice's in their order. next_of_slice: (num_slices,) int64 first place of each, advanced."""
+    """Requests slice by slice, each slice's in their order. next_of_slice: (num_slices,) int64
+    first place of each, advanced.
+    """
     for i in range(_U64(count)):
         at = _U64(next_of_slice[where[i]])
         next_of_slice[where[i]] += 1
@@ -84,8 +101,9 @@ def _sort_by_slice(  # type: ignore[no-untyped-def]
 class Level:
     """The caches of one level.
 
-    by_slice: whether a batch is worked off slice by slice, so that a slice's state stays in the host's own cache. The order
-        between slices is lost then, which only a level with nothing but DRAM below it may do; small sets do not need it.
+    by_slice: whether a batch is worked off slice by slice, so that a slice's state stays in the
+        host's own cache. The order between slices is lost then, which only a level with nothing but
+        DRAM below it may do; small sets do not need it.
     """
 
     def __init__(
@@ -100,9 +118,11 @@ class Level:
         bypass_stores: bool = False,
         byte_range: tuple[int, int] | None = None,
     ) -> None:
-        """num_instances: caches that a request's SM chooses among; of a sliced level 1, whatever its number of slices.
+        """num_instances: caches that a request's SM chooses among; of a sliced level 1, whatever
+        its number of slices.
 
-        is_last: nothing but DRAM is below. byte_range: first address and bytes that all requests lie in, where known.
+        is_last: nothing but DRAM is below. byte_range: first address and bytes that all requests
+            lie in, where known.
         """
         self.name = name
         self.config = config
@@ -124,13 +144,10 @@ class Level:
             self.rules = self.rules._replace(num_sets=self.rules.num_sets * self.num_slices)
         self._first_line, self._set_of_line = 0, np.zeros(0, np.uint32)
         self._seen = np.zeros(0, np.uint8)
-        # Distinct sectors asked of all instances together, which a level that is never emptied misses at least; None: not counted.
+        # Distinct sectors asked of all instances together, which a level that is never emptied
+        # misses at least; None: not counted.
         self.num_distinct: int | None = None
-        if (
-            lines is not None
-            and lines[1] <= _MAX_TABLE_LINES
-            and self.num_slices > 1
-        ):
+        if lines is not None and lines[1] <= _MAX_TABLE_LINES and self.num_slices > 1:
             self._tabulate(*lines)
         self.state = cache.empty_state(self.rules)
         self.counters = np.zeros((num_groups, cache.NUM_COUNTERS), np.int64)
@@ -138,11 +155,14 @@ class Level:
     def arrange(
         self, requests: Requests, buffer: Buffer
     ) -> tuple[Requests, npt.NDArray[np.uint32]]:
-        """The requests in the order in which they are worked off, and the set of each in its instance."""
+        """The requests in the order in which they are worked off, and the set of each in its
+        instance.
+        """
         count = requests.num_requests
         if self.num_distinct is not None:
             self.num_distinct += _look_up_sets(
-                requests.line, requests.mask, count, self._first_line, self._set_of_line, self._seen, buffer.sets
+                requests.line, requests.mask, count, self._first_line, self._set_of_line,
+                self._seen, buffer.sets,
             )  # fmt: skip
         else:
             self._locate(requests.line, count, buffer.sets)
@@ -154,7 +174,8 @@ class Level:
         out = buffer.by_slice
         assert out is not None
         _sort_by_slice(
-            requests.line, requests.mask, requests.meta, requests.written, buffer.sets, buffer.where, count, segments[:-1].copy(),
+            requests.line, requests.mask, requests.meta, requests.written, buffer.sets,
+            buffer.where, count, segments[:-1].copy(),
             out.line, out.mask, out.meta, out.written, buffer.sets_by_slice,
         )  # fmt: skip
         slices = np.arange(self.num_slices)
@@ -220,10 +241,13 @@ class Buffer:
 
 
 def _lines_of(byte_range: tuple[int, int] | None, line_bytes: int) -> tuple[int, int] | None:
-    """First line number and number of lines of a byte range, if 32 bits can tell its lines apart."""
+    """First line number and number of lines of a byte range, if 32 bits can tell them apart."""
     if byte_range is None:
         return None
-    first, last = byte_range[0] // line_bytes, (byte_range[0] + byte_range[1]) // line_bytes
+    # A level above with larger sectors asks for whole ones, beyond the range's ends.
+    start = byte_range[0] // MAX_LINE_BYTES * MAX_LINE_BYTES
+    end = -(-(byte_range[0] + byte_range[1]) // MAX_LINE_BYTES) * MAX_LINE_BYTES
+    first, last = start // line_bytes, end // line_bytes
     return (first, last - first + 1) if last - first < (1 << 32) - 2 else None
 
 

@@ -1,19 +1,19 @@
 """Finding a line and choosing its victim: two structures with the same behaviour.
 
-Hashed: any geometry and policy. A tag is found through a chained hash table, so that a set of 96 ways costs what one of 4 does;
-replacement is `cachesim.policies`.
+Hashed: any geometry and policy. A tag is found through a chained hash table, so that a set of 96
+    ways costs what one of 4 does; replacement is `cachesim.policies`.
 
-Small sets: up to 16 ways under LRU or FIFO, line numbers within 32 bits. The tags of a set are one host cache line, compared at
-once; their order of recency is sixteen 4-bit ways in one word, the newest lowest. Less memory, so that a whole L2's state stays
-in the host's own L2.
+Small sets: up to 16 ways under LRU or FIFO, line numbers within 32 bits. The tags of a set are one
+    host cache line, compared at once; their order of recency is sixteen 4-bit ways in one word, the
+    newest lowest. Less memory, so that a whole L2's state stays in the host's own L2.
 """
 
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from cachesim import policies
+from cachesim.compiled import inlined
 
 U64, U32 = np.uint64, np.uint32
 
@@ -21,7 +21,8 @@ NO_LINE = np.uint32(0xFFFFFFFF)
 SMALL_WAYS = 16
 #: A small set's tag for "none"; line numbers less the first stay below it.
 NO_TAG = np.uint32(0xFFFFFFFF)
-#: Ways 15 to 0 from the highest 4 bits down: way 0 is the newest, so that way ways - 1 is the first victim.
+#: Ways 15 to 0 from the highest 4 bits down: way 0 is the newest, so that way ways - 1 is the first
+#: victim.
 FIRST_RECENCY = np.uint64(0xFEDCBA9876543210)
 
 # Of the hash of a line number to its bucket (Fibonacci hashing).
@@ -38,13 +39,13 @@ _HIGH = np.uint64(0x8888888888888888)
 CHAIN = U64(2)
 
 
-@njit(cache=True, nogil=True, _nrt=False, inline="always")
+@inlined
 def bucket_of(number, first_bucket, shift):  # type: ignore[no-untyped-def]
     """The hash bucket of a line number in an instance whose buckets start at `first_bucket`."""
     return first_bucket + ((number * _MULTIPLIER) >> shift)
 
 
-@njit(cache=True, nogil=True, _nrt=False, inline="always")
+@inlined
 def find_hashed(tags, links, buckets, bucket, number):  # type: ignore[no-untyped-def]
     """The line that holds a tag, or `NO_LINE`."""
     line = buckets[bucket]
@@ -53,7 +54,7 @@ def find_hashed(tags, links, buckets, bucket, number):  # type: ignore[no-untype
     return line
 
 
-@njit(cache=True, nogil=True, _nrt=False, inline="always")
+@inlined
 def take_hashed(  # type: ignore[no-untyped-def]
     tags,
     links,
@@ -70,7 +71,9 @@ def take_hashed(  # type: ignore[no-untyped-def]
     shift,
     cache_set,
 ):
-    """Give a line of the set to a new tag, in the hash table and the ring; the caller sets the tag, the old one is still there."""
+    """Give a line of the set to a new tag, in the hash table and the ring; the caller sets the tag,
+    the old one is still there.
+    """
     line = policies.victim(policy, cache_set, ways, links, rrpv, newest, fills, tree)
     if used[line * U64(4)]:
         old = bucket_of(tags[line * U64(3)], first_bucket, shift)
@@ -86,9 +89,11 @@ def take_hashed(  # type: ignore[no-untyped-def]
     return line
 
 
-@njit(cache=True, nogil=True, _nrt=False, inline="always")
+@inlined
 def find_small(small_tags, tag, cache_set, num_tags):  # type: ignore[no-untyped-def]
-    """The line that holds a tag, or `NO_LINE`. num_tags: 16, which the compiler must not know or it does not vectorise."""
+    """The line that holds a tag, or `NO_LINE`. num_tags: 16, which the compiler must not know or it
+    does not vectorise.
+    """
     first = cache_set * U64(SMALL_WAYS)
     found = U32(0)
     for way in range(num_tags):
@@ -98,7 +103,7 @@ def find_small(small_tags, tag, cache_set, num_tags):  # type: ignore[no-untyped
     return U32(first + _BIT_PLACE[(U64(found) * _DE_BRUIJN) >> U64(58)])
 
 
-@njit(cache=True, nogil=True, _nrt=False, inline="always")
+@inlined
 def touch_small(recency, line, cache_set):  # type: ignore[no-untyped-def]
     """Move a line's way to the newest place."""
     order = recency[cache_set]
@@ -115,7 +120,7 @@ def touch_small(recency, line, cache_set):  # type: ignore[no-untyped-def]
         )
 
 
-@njit(cache=True, nogil=True, _nrt=False, inline="always")
+@inlined
 def take_small(recency, ways, cache_set):  # type: ignore[no-untyped-def]
     """The oldest line of the set, made the newest; the caller sets its tag."""
     order = recency[cache_set]

@@ -1,28 +1,34 @@
-"""Replacement policies: for each, what an access to a present line does (`touch`) and which line of a full set goes (`victim`).
+"""Replacement policies: for each, what an access to a present line does (`touch`) and which line of
+a full set goes (`victim`).
 
-Lines of a set form a ring in recency order (`newer`, `older`; `newest` names the set's most recent line), so that LRU and FIFO
-cost the same at 16 or 96 ways: the victim is the line next to the newest in ring order. Lines never used come first.
+Lines of a set form a ring in recency order (`newer`, `older`; `newest` names the set's most recent
+line), so that LRU and FIFO
+cost the same at 16 or 96 ways: the victim is the line next to the newest in ring order. Lines never
+used come first.
 
     policy     | an access does            | the victim is
     LRU        | moves the line to front   | the back of the ring
     FIFO       | nothing                   | the back of the ring
     TREE_PLRU  | points the tree away      | where the tree points
     RANDOM     | nothing                   | a hash of the set's fill count
-    SRRIP      | re-reference value := 0   | the first line at 3, after ageing all until there is one [Jaleel et al. 2010, SRRIP-HP]
+    SRRIP      | re-reference value := 0   | the first line at 3, after ageing all
+               |                           | until there is one
+
+SRRIP is SRRIP-HP of [Jaleel et al. 2010].
 """
 
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from cachesim.address import mix64
-
+from cachesim.compiled import inlined
 
 LRU, FIFO, TREE_PLRU, RANDOM, SRRIP = range(5)
 CODES = {"lru": LRU, "fifo": FIFO, "tree-plru": TREE_PLRU, "random": RANDOM, "srrip": SRRIP}
 
-#: SRRIP with 2-bit values: a new line is predicted to come back after a long time, a line at 3 in the distant future.
+#: SRRIP with 2-bit values: a new line is predicted to come back after a long time, a line at 3 in
+#: the distant future.
 SRRIP_NEW, SRRIP_MAX = 2, 3
 
 U64 = np.uint64
@@ -32,9 +38,11 @@ U32 = np.uint32
 NEWER, OLDER = U64(3), U64(4)
 
 
-@njit(cache=True, nogil=True, _nrt=False, inline="always")
+@inlined
 def _to_front(line, cache_set, links, newest):  # type: ignore[no-untyped-def]
-    """Make `line` the newest of its set's ring. OLDER walks back in time; what is newer than the newest is the oldest."""
+    """Make `line` the newest of its set's ring. OLDER walks back in time; what is newer than the
+    newest is the oldest.
+    """
     front = newest[cache_set]
     if line != front:
         before, after = links[line * U64(6) + NEWER], links[line * U64(6) + OLDER]
@@ -48,7 +56,7 @@ def _to_front(line, cache_set, links, newest):  # type: ignore[no-untyped-def]
         newest[cache_set] = line
 
 
-@njit(cache=True, nogil=True, _nrt=False, inline="always")
+@inlined
 def _point_away(way, ways, cache_set, tree):  # type: ignore[no-untyped-def]
     """Set the tree bits on the path to `way` so that they point to the other side."""
     bits = tree[cache_set]
@@ -66,7 +74,7 @@ def _point_away(way, ways, cache_set, tree):  # type: ignore[no-untyped-def]
     tree[cache_set] = bits
 
 
-@njit(cache=True, nogil=True, _nrt=False, inline="always")
+@inlined
 def _pointed_way(ways, cache_set, tree):  # type: ignore[no-untyped-def]
     """The way the tree points to; a side without ways (ways not a power of two) is never taken."""
     bits = tree[cache_set]
@@ -82,7 +90,7 @@ def _pointed_way(ways, cache_set, tree):  # type: ignore[no-untyped-def]
     return low
 
 
-@njit(cache=True, nogil=True, _nrt=False, inline="always")
+@inlined
 def touch(policy, line, cache_set, ways, links, rrpv, newest, tree):  # type: ignore[no-untyped-def]
     """A present line was accessed."""
     if policy == LRU:
@@ -93,9 +101,11 @@ def touch(policy, line, cache_set, ways, links, rrpv, newest, tree):  # type: ig
         rrpv[line] = 0
 
 
-@njit(cache=True, nogil=True, _nrt=False, inline="always")
+@inlined
 def victim(policy, cache_set, ways, links, rrpv, newest, fills, tree):  # type: ignore[no-untyped-def]
-    """The line of the set that a new tag replaces, marked as just inserted. Unused lines go first, in way order."""
+    """The line of the set that a new tag replaces, marked as just inserted. Unused lines go first,
+    in way order.
+    """
     first = U64(cache_set) * ways
     if policy == LRU or policy == FIFO:
         line = links[newest[cache_set] * U64(6) + NEWER]

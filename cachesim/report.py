@@ -1,10 +1,13 @@
-"""The report: integer counters per level with a stated population, ratios derived from them, and the laws they obey.
+"""The report: integer counters per level with a stated population, ratios derived from them, and
+the laws they obey.
 
-Every count of a level is in that level's sectors (`sector_bytes` stands beside it), except `requests`, which are tag look-ups.
+Every count of a level is in that level's sectors (`sector_bytes` stands beside it), except
+`requests`, which are tag look-ups.
 """
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any
@@ -20,11 +23,15 @@ class ConservationError(AssertionError):
 class LevelCounters:
     """What one level was asked and did.
 
-    requests: tag look-ups. accesses: sectors presented and looked up, stores included. hits, line_misses (no tag) and
-    sector_misses (tag, sector absent): outcomes of accesses. merged: misses that joined one in flight (0 without a clock).
-    writes: stores and atomics among accesses; write_misses: those among the misses. stores_down: store sectors passed to the next
-    level. write_fills: sectors fetched so that a store can be merged. bypasses: sectors that passed without look-up, not accesses;
-    bypassed_writes: stores and atomics among them. writebacks: dirty sectors evicted. dirty_at_end: dirty sectors still held.
+    requests: tag look-ups. accesses: sectors presented and looked up, stores included. hits,
+        line_misses (no tag) and sector_misses (tag, sector absent): outcomes of accesses. merged:
+        misses that joined one in flight (0 without a clock).
+    writes: stores and atomics among accesses; write_misses: those among the misses. stores_down:
+        store sectors passed to the next
+    level. write_fills: sectors fetched so that a store can be merged. bypasses: sectors that passed
+        without look-up, not accesses;
+    bypassed_writes: stores and atomics among them. writebacks: dirty sectors evicted. dirty_at_end:
+        dirty sectors still held.
     """
 
     sector_bytes: int
@@ -64,7 +71,9 @@ class LevelCounters:
 
     @property
     def reads_down(self) -> int:
-        """Sectors asked of the next level for reading: load misses not merged, fetches for stores, bypassed loads."""
+        """Sectors asked of the next level for reading: load misses not merged, fetches for stores,
+        bypassed loads.
+        """
         read_misses = self.misses - self.write_misses - self.merged
         return read_misses + self.write_fills + self.bypasses - self.bypassed_writes
 
@@ -126,9 +135,12 @@ class Part:
 class Report:
     """What one trace asked of one GPU.
 
-    gpu: preset name. trace: identification of the trace. counters: by level, from the SM down. parts: None for a trace without
-    provenance. num_rows: warp instructions issued. distinct_sectors: of the sliced levels, which are never emptied, how many
-    different sectors were asked (compulsory misses); levels where it was not counted, or that something went around, are absent. cycles, time_ms: None without timing. timings: host seconds per stage.
+    gpu: preset name. trace: identification of the trace. counters: by level, from the SM down.
+        parts: None for a trace without
+    provenance. num_rows: warp instructions issued. distinct_sectors: of the sliced levels, which
+        are never emptied, how many different sectors were asked (compulsory misses); levels where
+        it was not counted, or that something went around, are absent. cycles, time_ms: None without
+        timing. timings: host seconds per stage.
     """
 
     gpu: str
@@ -151,7 +163,9 @@ class Report:
 
     @property
     def demand(self) -> dict[str, int]:
-        """Demand in bytes: of each level the sectors looked up there, of DRAM those moved; lane fetches as a count."""
+        """Demand in bytes: of each level the sectors looked up there, of DRAM those moved; lane
+        fetches as a count.
+        """
         presented = {f"{n}_bytes": c.demand_bytes for n, c in self.counters.items()}
         return {"lane_fetches": self.lane_fetches, **presented, "dram_bytes": self.dram.bytes}
 
@@ -175,7 +189,7 @@ class Report:
                 _law(f"{name}: 0 <= {part} <= {whole}", True, holds)
             held = c.writebacks + c.dirty_at_end
             _law(f"{name}: writebacks + dirty_at_end <= writes", True, held <= c.writes)
-        for upper, lower in zip(names, names[1:], strict=False):
+        for upper, lower in itertools.pairwise(names):
             u, d = self.counters[upper], self.counters[lower]
             passed = (u.reads_down + u.writes_down) * u.sector_bytes
             _law(
@@ -219,7 +233,7 @@ class Report:
             )
 
     def level_json(self, level: str) -> dict[str, Any]:
-        """A level's entry: its counters, and `distinct_sectors`, None where they were not counted."""
+        """A level's entry: its counters, and `distinct_sectors`, None where not counted."""
         return self.counters[level].to_json() | {
             "distinct_sectors": self.distinct_sectors.get(level)
         }
@@ -263,7 +277,9 @@ class Report:
         return pd.DataFrame(rows).astype({"miss_rate": float, "distinct_sectors": "Int64"})
 
     def by_frame(self) -> pd.DataFrame:
-        """One row per pass x texture x mip x level; DRAM is a level of its own with `bytes`. Empty without provenance."""
+        """One row per pass x texture x mip x level; DRAM is a level of its own with `bytes`. Empty
+        without provenance.
+        """
         rows: list[dict[str, Any]] = []
         for p in self.parts or ():
             key = {

@@ -1,7 +1,8 @@
-"""From one level's outcome to the next level's requests: what is passed down, in issue order, in the next level's lines and sectors.
+"""From one level's outcome to the next level's requests: what is passed down, in issue order, in
+the next level's lines and sectors.
 
-A request's own sectors go first (fetches for a load, the store itself otherwise), then the fetch that a store needs, then the
-write-back of the line it evicted.
+A request's own sectors go first (fetches for a load, the store itself otherwise), then the fetch
+that a store needs, then the write-back of the line it evicted.
 """
 
 from __future__ import annotations
@@ -9,14 +10,17 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from cachesim.compiled import inlined
 from cachesim.stream import ATOMIC, GROUP_BITS, GROUP_MASK, LOAD, STORE, Outcome, Requests
 
 U64, U32 = np.uint64, np.uint32
 
 
-@njit(cache=True, nogil=True, inline="always")
+@inlined
 def _scaled_bytes(bits, upper_sector_bytes, lower_sector_bytes, part, lower_all):  # type: ignore[no-untyped-def]
-    """The byte bits of part `part` of an upper sector, in the granules of a lower sector of the same or smaller size."""
+    """The byte bits of part `part` of an upper sector, in the granules of a lower sector of the
+    same or smaller size.
+    """
     upper_granule = max(1, upper_sector_bytes // 32)
     lower_granule = max(1, lower_sector_bytes // 32)
     scaled = U32(0)
@@ -42,10 +46,11 @@ def pass_down(  # type: ignore[no-untyped-def]
     bytes_written,
     position,
 ):
-    """Write the next level's requests into line, mask, meta, written, bytes_written; returns (requests, stores) written.
+    """Write the next level's requests into line, mask, meta, written, bytes_written; returns
+    (requests, stores) written.
 
-    position: (n,) int64, the segment of the batch that each came from. The output arrays hold at least
-    `bound_passed_down` entries. Lower sectors divide upper ones.
+    position: (n,) int64, the segment of the batch that each came from. The output arrays hold at
+        least `bound_passed_down` entries. Lower sectors divide upper ones.
     """
     sectors = upper_line_bytes // upper_sector_bytes
     parts = upper_sector_bytes // lower_sector_bytes
@@ -138,7 +143,7 @@ def pass_down(  # type: ignore[no-untyped-def]
     return num, stores
 
 
-@njit(cache=True, nogil=True, inline="always")
+@inlined
 def _append(  # type: ignore[no-untyped-def]
     upper_line,
     sector,
@@ -162,10 +167,13 @@ def _append(  # type: ignore[no-untyped-def]
     num,
     stores,
 ):
-    """Append one upper sector to the lower requests: to the last one where it is the same access and line, else as a new one."""
+    """Append one upper sector to the lower requests: to the last one where it is the same access
+    and line, else as a new one.
+    """
     for part in range(parts):
         offset = U64(sector * upper_sector_bytes + part * lower_sector_bytes)
-        # Only the number of the line is kept: a line number times its size may not fit in 64 bits when it is off by one.
+        # Only the number of the line is kept: a line number times its size may not fit in 64 bits
+        # when it is off by one.
         if lower_line_bytes <= upper_line_bytes:
             lower = upper_line * U64(upper_line_bytes // lower_line_bytes) + offset // U64(
                 lower_line_bytes

@@ -5,6 +5,7 @@ trace ──► place texels ──► dispatch ──► coalesce ──► L1 
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 
@@ -38,13 +39,11 @@ def simulate(
 ) -> Report:
     """Count what a trace asks of a GPU's caches and memory.
 
-    Args:
-        trace: recorded, read from a file, imported or synthetic.
-        gpu: a configuration or the name of a preset.
-        fetch_path: "texture", "readonly" or "global"; None takes "texture", or for a lane-address trace the GPU's own default.
-        layout: texel layout; None takes the GPU's. layouts: other layouts for single textures, by name.
-        threaded: run the stages side by side; the result is the same.
-        progress: called with the number of lane fetches counted so far.
+    Args: trace: recorded, read from a file, imported or synthetic. gpu: a configuration or the name
+        of a preset. fetch_path: "texture", "readonly" or "global"; None takes "texture", or for a
+        lane-address trace the GPU's own default. layout: texel layout; None takes the GPU's.
+        layouts: other layouts for single textures, by name. threaded: run the stages side by side;
+        the result is the same. progress: called with the number of lane fetches counted so far.
 
     Raises:
         InputError: unknown GPU, fetch path or layout, or a trace that does not fit.
@@ -71,7 +70,9 @@ def simulate_all(
     threaded: bool = True,
     progress: Progress | None = None,
 ) -> list[Report]:
-    """`simulate` for several GPUs in one pass over the trace's chunks, so that a live recording renders once."""
+    """`simulate` for several GPUs in one pass over the trace's chunks, so that a live recording
+    renders once.
+    """
     chosen = [presets.load(g) if isinstance(g, str) else g for g in gpus]
     alone = len(chosen) == 1
     models = [
@@ -211,8 +212,7 @@ class _Model:
             distinct_sectors={
                 level.name: level.num_distinct
                 for level in levels
-                if level.num_distinct is not None
-                and not level.counters[:, cache.BYPASSES].any()
+                if level.num_distinct is not None and not level.counters[:, cache.BYPASSES].any()
             },
             timings=dict(hierarchy.timings),
         )
@@ -221,7 +221,8 @@ class _Model:
 def hierarchy_levels(
     gpu: Gpu, fetch_path: str, num_groups: int, byte_range: tuple[int, int] | None = None
 ) -> tuple[list[Level], list[int]]:
-    """The levels of a GPU under a fetch path, and per level how many L1 units share one instance (all, where sliced).
+    """The levels of a GPU under a fetch path, and per level how many L1 units share one instance
+    (all, where sliced).
 
     The first entry of the second list is the number of L1 units per SM.
 
@@ -255,7 +256,7 @@ def hierarchy_levels(
                 Level(name, config, 1, num_groups, is_last=is_last, byte_range=byte_range)
             )
             sharing.append(units)
-    for upper, lower in zip(levels, levels[1:], strict=False):
+    for upper, lower in itertools.pairwise(levels):
         _check_sectors(gpu, upper.name, upper.config, lower.name, lower.config)
     return levels, sharing
 
@@ -265,8 +266,8 @@ def _check_sectors(
 ) -> None:
     if upper.sector_bytes % lower.sector_bytes:
         raise InputError(
-            f"{gpu.name}: {lower_name}.sector_bytes = {lower.sector_bytes}: must divide {upper_name}.sector_bytes = "
-            f"{upper.sector_bytes}"
+            f"{gpu.name}: {lower_name}.sector_bytes = {lower.sector_bytes}: must divide "
+            f"{upper_name}.sector_bytes = {upper.sector_bytes}"
         )
 
 

@@ -1,6 +1,8 @@
-"""Request streams: what passes between the stages of the counting model, as flat arrays in issue order.
+"""Request streams: what passes between the stages of the counting model, as flat arrays in issue
+order.
 
-A request is one warp instruction's access to one line of the level that the stream is for. Batches are bounded; no stage holds more.
+A request is one warp instruction's access to one line of the level that the stream is for. Batches
+are bounded; no stage holds more.
 """
 
 from __future__ import annotations
@@ -21,11 +23,14 @@ GROUP_MASK = (1 << GROUP_BITS) - 1
 class Requests(NamedTuple):
     """A batch of requests to one level.
 
-    line: (n,) uint64, byte address / line_bytes. mask: (n,) uint8, the sectors asked for, bit s = sector s of the line.
+    line: (n,) uint64, byte address / line_bytes. mask: (n,) uint8, the sectors asked for, bit s =
+        sector s of the line.
     meta: (n,) uint32, operation code << 24 | group; a group is one pass x texture x mip.
     written: (n,) int32, row of `bytes_written` of a store; undefined otherwise.
-    bytes_written: (num_stores, 8) uint32, per sector the bytes that a store covers, one bit per sector_bytes / 32 (at least 1) bytes.
-    segments: (num_segments + 1,) int64, offsets of the runs that go to one cache instance; instance: (num_segments,) uint32.
+    bytes_written: (num_stores, 8) uint32, per sector the bytes that a store covers, one bit per
+        sector_bytes / 32 (at least 1) bytes.
+    segments: (num_segments + 1,) int64, offsets of the runs that go to one cache instance;
+        instance: (num_segments,) uint32.
     order: (num_segments,) int64, the segments in issue order.
     """
 
@@ -46,10 +51,13 @@ class Requests(NamedTuple):
 class Outcome(NamedTuple):
     """What one level did with a batch, request by request, in the batch's own order.
 
-    down: (n,) uint8, sectors of the request's line that go to the next level as the request's own operation, or as a load where
-        `fill` is set. fill: (n,) uint8, sectors to fetch so that a store can be merged.
-    evicted_line: (n,) uint64, and per sector evicted_owner: (n, 8) int32, 1 + the group that dirtied it, 0 = not written back;
-    evicted_bytes: (n, 8) uint32, the bytes it holds. Empty arrays where the level cannot hold dirty lines.
+    down: (n,) uint8, sectors of the request's line that go to the next level as the request's own
+        operation, or as a load where `fill` is set. fill: (n,) uint8, sectors to fetch so that a
+        store can be merged.
+    evicted_line: (n,) uint64, and per sector evicted_owner: (n, 8) int32, 1 + the group that
+        dirtied it, 0 = not written back;
+    evicted_bytes: (n, 8) uint32, the bytes it holds. Empty arrays where the level cannot hold dirty
+        lines.
     """
 
     down: npt.NDArray[np.uint8]

@@ -97,12 +97,19 @@ def findings(ratios: pd.DataFrame, size: str) -> list[str]:
         "MB = 10^6 B; miss rates are local: misses / accesses of that level. A sector is 32 B on "
         "NVIDIA and 128 B in RDNA's L0 and L2, so a scattered texel asks for more there.",
         f"The L2 and DRAM columns depend on the resolution: at {size} the frame has another size "
-        "relative to the L2 than at the paper's 1080p.",
+        "relative to the L2 than at 1080p, the size of the paper's times (that of its GPGPU-Sim "
+        "study is not known).",
     ]
     for name, level in DEMAND_NAMES.items():
         text = f"{level} demand, adaptive / fixed: {_span(whole, name)}; "
         text += f"in the sampling pass {_span(sampling, name)}. "
-        if above := _where(whole, name):
+        above = _where(whole, name)
+        if level == "DRAM":
+            text += "The paper shows no DRAM traffic. "
+            text += (
+                f"More for adaptive: {above}. {EXTRA}" if above else "Less for adaptive everywhere."
+            )
+        elif above:
             text += f"Disagrees with the paper, which shows less for adaptive: {above}. {EXTRA}"
         else:
             text += "Lower for adaptive everywhere, as the paper shows."

@@ -82,7 +82,7 @@ def load_exr(path: str | Path, projection_x: float | None = None) -> GBuffer:
     missing channel, channels of different size, values that GBuffer refuses.
     """
     path = _existing(path)
-    import OpenEXR  # type: ignore[import-not-found]
+    import OpenEXR
 
     try:
         with OpenEXR.File(str(path), separate_channels=True) as file:

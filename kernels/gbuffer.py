@@ -1,4 +1,6 @@
-"""The G-buffer: what a scene hands to the subsurface passes, whatever made it (procedural head, mesh, capture)."""
+"""The G-buffer: what a scene hands to the subsurface passes, whatever made it (procedural head,
+mesh, capture).
+"""
 
 from __future__ import annotations
 
@@ -17,15 +19,18 @@ class GBuffer:
     """One view of a scene.
 
     name: as tables print it. attribution: the line to show beside pictures, "" if none is owed.
-    irradiance: (h, w, 3) float32, linear, diffuse lighting without albedo; what subsurface scattering blurs.
+    irradiance: (h, w, 3) float32, linear, diffuse lighting without albedo; what subsurface
+        scattering blurs.
     albedo: (h, w, 3) float32 in [0, 1], linear base colour, multiplied after scattering.
-    non_subsurface: (h, w, 3) float32, linear: speculars, background and everything that does not scatter.
+    non_subsurface: (h, w, 3) float32, linear: speculars, background and everything that does not
+        scatter.
     depth_cm: (h, w) float32, linear view depth in cm; 0 where nothing is.
     normal: (h, w, 3) float32, unit world-space normal; 0 where nothing is.
     profile_id: (h, w) uint8; 0 = no subsurface scattering, 1 = skin.
-    projection_x: M = 1 / tan(fov_x / 2), so that pixels per mm at depth z cm = 0.05 * w * M / z (facts sheet 2.5).
-    velocity: (h, w, 2) float32, texels: where the surface of a pixel stood in the previous frame, minus where it stands now;
-        None = nothing moves.
+    projection_x: M = 1 / tan(fov_x / 2), so that pixels per mm at depth z cm = 0.05 * w * M / z
+        (facts sheet 2.5).
+    velocity: (h, w, 2) float32, texels: where the surface of a pixel stood in the previous frame,
+        minus where it stands now; None = nothing moves.
     """
 
     name: str
@@ -66,7 +71,8 @@ class GBuffer:
         value = getattr(self, field)
         if value.shape != shape or value.dtype != dtype:
             raise InputError(
-                f"{self.name}: {field}: {value.dtype} of shape {value.shape}: need {np.dtype(dtype)} of {shape}"
+                f"{self.name}: {field}: {value.dtype} of shape {value.shape}: "
+                f"need {np.dtype(dtype)} of {shape}"
             )
         if not np.isfinite(value).all():
             raise InputError(

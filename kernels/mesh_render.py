@@ -111,8 +111,8 @@ class _Caster:
     """Embree's scene of one mesh."""
 
     def __init__(self, mesh: Mesh) -> None:
-        from embreex.mesh_construction import TriangleMesh  # type: ignore[import-untyped]
-        from embreex.rtcore_scene import EmbreeScene  # type: ignore[import-untyped]
+        from embreex.mesh_construction import TriangleMesh
+        from embreex.rtcore_scene import EmbreeScene
 
         self._scene = EmbreeScene(robust=True)
         self._triangles = TriangleMesh(self._scene, np.ascontiguousarray(mesh.corners))

@@ -98,7 +98,8 @@ def test_every_package_imported_is_a_declared_dependency():
     for room in ROOMS:
         for path in sources(room):
             for package in set(imported_packages(path)) - set(ROOMS) - sys.stdlib_module_names:
-                # A distribution of one extension module has no entry there on Python 3.11: it is named like its module.
+                # A distribution of one extension module has no entry there on Python 3.11: it is
+                # named like its module.
                 providers = {canonicalize_name(name) for name in owners.get(package, [package])}
                 assert providers & declared, f"{path.relative_to(ROOT)} imports {package}"
 

@@ -38,6 +38,8 @@ COUNTERS = (
     "writebacks",
 )
 NUM_GROUPS = 3
+#: Loads, stores and atomics among a batch's requests.
+RATES = ((1, 0, 0), (0.7, 0.25, 0.05), (0.1, 0.9, 0), (0.03, 0.95, 0.02))
 
 
 def level_of(num_sets: int, ways: int, **fields: object) -> CacheLevel:
@@ -86,8 +88,9 @@ def cases(draw):
     # A first line, up to 16 ways and LRU or FIFO make the sets small (`cachesim.lookup`).
     first_line = draw(st.sampled_from([None, 0, 2**40 + 7]))
     policy = draw(st.sampled_from(POLICIES if first_line is None else ("lru", "fifo", "srrip")))
-    num_sets = draw(st.one_of(st.integers(1, 7), st.sampled_from([16, 33])))
-    ways = draw(st.one_of(st.integers(1, 16), st.integers(9, 64 if policy == "tree-plru" else 100)))
+    # Few sets where they have many ways, so that some hundred requests fill them.
+    ways = draw(st.integers(1, 16) | st.integers(9, 64 if policy == "tree-plru" else 100))
+    num_sets = draw(st.sampled_from([1, 2, 3, 7, 16] if ways <= 8 else [1, 2, 3]))
     line_bytes, sector_bytes = draw(
         st.sampled_from(
             [(128, 32), (128, 128), (64, 64), (256, 32), (128, 16), (16, 16), (4096, 512)]
@@ -99,41 +102,40 @@ def cases(draw):
         line_bytes=line_bytes,
         sector_bytes=sector_bytes,
         replacement=policy,
-        write_policy=draw(st.sampled_from(WRITE_POLICIES)),
+        write_policy=draw(st.sampled_from([*WRITE_POLICIES, "write-back", "write-back"])),
         write_allocate=draw(st.sampled_from(ALLOCATIONS)),
     )
     num_instances = draw(st.integers(1, 3))
     bypass_loads = draw(st.sampled_from([False, False, False, True]))
     bypass_stores = level.write_policy == "read-only" or draw(
-        st.sampled_from([False, False, False, True])
+        st.sampled_from([False, False, False, False, False, True])
     )
     random = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
     # From mostly hits to mostly misses; anywhere in the 64-bit range.
-    num_lines = max(1, int(num_sets * ways * draw(st.sampled_from([0.5, 1.1, 2, 6]))))
+    num_lines = max(1, int(num_sets * ways * draw(st.sampled_from([0.5, 1.1, 1.5, 4]))))
     lowest, highest = (0, 2**64 - 1) if first_line is None else (first_line, first_line + 2**32 - 2)
     base = draw(st.sampled_from([lowest, highest - num_lines + 1]))
     pool = np.uint64(base) + np.arange(num_lines, dtype=np.uint64)
     if draw(st.booleans()):
         pool = random.integers(lowest, highest, num_lines, dtype=np.uint64, endpoint=True)
-    store_rate = draw(st.sampled_from([0.0, 0.3, 0.8]))
+    rates = draw(st.sampled_from(RATES))
     batches = [
-        batch_of(random, pool, level, num_instances, draw(st.integers(0, 400)), store_rate)
+        batch_of(random, pool, level, num_instances, draw(st.sampled_from([500, 5, 0])), rates)
         for _ in range(2)
     ]
     return level, num_instances, bypass_loads, bypass_stores, first_line, batches
 
 
-def batch_of(random, pool, level, num_instances, n, store_rate):
+def batch_of(random, pool, level, num_instances, n, rates):
     sectors = level.sectors_per_line
     every_byte = (1 << min(32, level.sector_bytes)) - 1
     written = random.integers(1, every_byte, (n, 8), dtype=np.uint64, endpoint=True)
     # Halves that add up, and whole sectors, are what real stores write.
-    shape = random.integers(0, 4, (n, 8))
+    shape = random.choice(4, (n, 8), p=[0.3, 0.1, 0.3, 0.3])
     low = max(1, every_byte & 0xFFFF)
     written = np.choose(shape, [written, every_byte, low, max(1, every_byte ^ low)])
     cuts = np.sort(random.integers(0, n + 1, random.integers(0, 6)))
     segments = np.concatenate([[0], cuts, [n]])
-    rates = [1 - store_rate, 0.8 * store_rate, 0.2 * store_rate]
     return requests_of(
         random.choice(pool, n),
         random.integers(1, 1 << sectors, n),

@@ -35,9 +35,7 @@ def test_a_whole_report_passes_its_check(report: Report) -> None:
 
 
 @pytest.mark.parametrize("level", ["l1", "gl1", "l2"])
-@pytest.mark.parametrize(
-    "counter", sorted(set(COUNTS) - {"dirty_at_end", "requests", "writes"})
-)
+@pytest.mark.parametrize("counter", sorted(set(COUNTS) - {"dirty_at_end", "requests", "writes"}))
 def test_no_counter_that_moves_data_can_be_off_by_one(report, level, counter) -> None:
     without_parts = dataclasses.replace(report, parts=None)
     with pytest.raises(ConservationError, match="law broken"):

@@ -1,4 +1,4 @@
-"""The error of bad user input: one line naming the file, the field, the value and what is allowed."""
+"""The error of bad user input: one line naming file, field, value and what is allowed."""
 
 import difflib
 from collections.abc import Iterable
@@ -18,4 +18,6 @@ def unknown(what: str, name: str, known: Iterable[str], where: str = "") -> Inpu
 
 
 class WorkError(RuntimeError):
-    """A failure while working: no space, no device. The command line prints it as one line and exits with code 1."""
+    """A failure while working: no space, no device. The command line prints it as one line and
+    exits with code 1.
+    """

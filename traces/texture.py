@@ -1,7 +1,7 @@
 """Texture descriptors and packed texel coordinates.
 
-A texel coordinate is one uint32, `mip << 28 | y << 14 | x`: 15 mips (0..14) and sides up to 16384 texels. Mip 15 is not used, so
-that 0xFFFFFFFF can mark an inactive lane.
+A texel coordinate is one uint32, `mip << 28 | y << 14 | x`: 15 mips (0..14) and sides up to 16384
+texels. Mip 15 is not used, so that 0xFFFFFFFF can mark an inactive lane.
 """
 
 from __future__ import annotations
@@ -48,9 +48,11 @@ def unpack_texel(
 
 @dataclass(frozen=True)
 class Texture:
-    """A two-dimensional texture with a mip chain; where its texels lie in memory is a layout's matter.
+    """A two-dimensional texture with a mip chain; where its texels lie in memory is a layout's
+    matter.
 
-    name: as tables print it. format: a key of `FORMATS`. width, height: texels of mip 0. num_mips: levels, at least 1.
+    name: as tables print it. format: a key of `FORMATS`. width, height: texels of mip 0. num_mips:
+        levels, at least 1.
     """
 
     name: str
@@ -65,7 +67,8 @@ class Texture:
         for field, side in (("width", self.width), ("height", self.height)):
             if not 1 <= side <= MAX_SIDE_TEXELS:
                 raise InputError(
-                    f"texture {self.name!r}: {field} {side}: allowed are 1 to {MAX_SIDE_TEXELS} texels"
+                    f"texture {self.name!r}: {field} {side}: "
+                    f"allowed are 1 to {MAX_SIDE_TEXELS} texels"
                 )
         if not 1 <= self.num_mips <= MAX_MIPS:
             raise InputError(
@@ -77,5 +80,7 @@ class Texture:
         return FORMATS[self.format]
 
     def mip_size(self, mip: int) -> tuple[int, int]:
-        """(width, height) of a level in texels: each side halves, rounded down, and never falls below 1."""
+        """(width, height) of a level in texels: each side halves, rounded down, and never falls
+        below 1.
+        """
         return max(1, self.width >> mip), max(1, self.height >> mip)

@@ -1,8 +1,9 @@
 """The Trace: every texel fetch of a frame as warp-wide access instructions with provenance.
 
-One row is one access instruction of one warp. A row names its `Instruction` (the static access in the pass's program: pass,
-texture, operation, footprint, the arithmetic before it) and has one packed texel coordinate, or one byte address, per lane.
-Rows come in `Chunk`s of whole CTAs of one launch, in launch, CTA, warp, step order; no stage needs more than a chunk at a time.
+One row is one access instruction of one warp. A row names its `Instruction` (the static access in
+the pass's program: pass, texture, operation, footprint, the arithmetic before it) and has one
+packed texel coordinate, or one byte address, per lane. Rows come in `Chunk`s of whole CTAs of one
+launch, in launch, CTA, warp, step order; no stage needs more than a chunk at a time.
 """
 
 from __future__ import annotations
@@ -26,11 +27,14 @@ class Instruction:
 
     pass_name: "setup", "prefilter", "sampling", "update", "combine", or what the importer says.
     texture: index into `Trace.textures`; -1 for a lane-address trace, which has none.
-    operation: one of `OPERATIONS`. footprint: one of `FOOTPRINTS`; a bilinear row's coordinate is the top-left texel of the
-        2x2 footprint, whose other texels are clamped to the level's edge.
-    access_bytes: bytes each lane moves at its address; the texel's size unless this is a lane-address trace.
-    arithmetic: warp instructions issued since the previous access, as (kind, count) pairs; kinds are "int", "fp32", "sfu", ...
-    num_outstanding: how many of the warp's earlier accesses may still be in flight when this one issues; -1 = any number.
+    operation: one of `OPERATIONS`. footprint: one of `FOOTPRINTS`; a bilinear row's coordinate is
+        the top-left texel of the 2x2 footprint, whose other texels are clamped to the level's edge.
+    access_bytes: bytes each lane moves at its address; the texel's size unless this is a
+        lane-address trace.
+    arithmetic: warp instructions issued since the previous access, as (kind, count) pairs; kinds
+        are "int", "fp32", "sfu", ...
+    num_outstanding: how many of the warp's earlier accesses may still be in flight when this one
+        issues; -1 = any number.
     """
 
     pass_name: str
@@ -64,11 +68,11 @@ class Chunk:
     """The rows of the CTAs [first_cta, first_cta + num_ctas) of one launch.
 
     launch: index into `Trace.launches`. first_cta: first CTA of the chunk in launch order.
-    warp_offsets: (num_ctas * warps_per_cta + 1,) int64; warp w of the chunk owns rows warp_offsets[w] to warp_offsets[w+1] - 1,
-        its accesses in program order.
+    warp_offsets: (num_ctas * warps_per_cta + 1,) int64; warp w of the chunk owns rows
+        warp_offsets[w] to warp_offsets[w+1] - 1, its accesses in program order.
     instruction: (num_rows,) uint16, index into `Trace.instructions`.
-    lanes: (num_rows, 32) uint32 packed texels with `INACTIVE_TEXEL` where a lane is inactive, or uint64 byte addresses with
-        `INACTIVE_ADDRESS` there.
+    lanes: (num_rows, 32) uint32 packed texels with `INACTIVE_TEXEL` where a lane is inactive, or
+        uint64 byte addresses with `INACTIVE_ADDRESS` there.
     """
 
     launch: int
@@ -99,11 +103,13 @@ class Chunk:
 
 @dataclass(eq=False)
 class Trace:
-    """A recording: descriptions, and a source of chunks that can be opened again for every pass over the data.
+    """A recording: descriptions, and a source of chunks that can be opened again for every pass
+    over the data.
 
-    manifest: JSON-able provenance: scene, method, parameters, seed, kernel source hash, device, versions.
-    textures, instructions: what rows refer to. launches: in execution order; a live recording may append to it while its chunks
-        are consumed, a chunk's own launch is always there.
+    manifest: JSON-able provenance: scene, method, parameters, seed, kernel source hash, device,
+        versions.
+    textures, instructions: what rows refer to. launches: in execution order; a live recording may
+        append to it while its chunks are consumed, a chunk's own launch is always there.
     source: makes a new iterator of chunks. A live recording renders again; a file is read again.
     """
 
