@@ -35,7 +35,8 @@ FORMATS: dict[str, int] = {
 def pack_texel(mip: Any, y: Any, x: Any) -> npt.NDArray[np.uint32]:
     """Pack texel coordinates. `mip`, `y`, `x`: broadcastable integer arrays; no range check."""
     mip, y, x = (np.asarray(v).astype(np.uint32) for v in (mip, y, x))
-    return (mip << np.uint32(28)) | (y << np.uint32(14)) | x
+    packed: npt.NDArray[np.uint32] = (mip << np.uint32(28)) | (y << np.uint32(14)) | x
+    return packed
 
 
 def unpack_texel(
