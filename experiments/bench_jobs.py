@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from cachesim import Report, presets, simulate
+from cachesim.first_use import compile_loops
 from experiments.bench import row_name
 from experiments.options import parse_image_size
 from kernels.device import open_device
@@ -56,6 +57,7 @@ def measure_stream(gbuffer: GBuffer, method: Method, gpu: str) -> dict[str, Any]
         live.instructions,
         live.launches,
     )
+    compile_loops()
     report = simulate(held, gpu, threaded=False)
     counting = sum(s for name, s in report.timings.items() if name in ("l1", "route", "l2"))
     return _row(report, counting, counting) | {"stages": dict(report.timings)}
@@ -63,6 +65,7 @@ def measure_stream(gbuffer: GBuffer, method: Method, gpu: str) -> dict[str, Any]
 
 def measure_pipeline(gbuffer: GBuffer, method: Method, gpu: str) -> dict[str, Any]:
     """Recording and counting in one go."""
+    compile_loops()
     start = time.perf_counter()
     trace, waiting = timed(record(gbuffer, method, num_frames=NUM_FRAMES if method.adaptive else 1))
     report = simulate(trace, gpu)

@@ -25,6 +25,7 @@ def command(
 ) -> None:
     """Line misses of a level under its own policy, and under Belady's OPT, which none can beat."""
     from cachesim import belady, presets
+    from cachesim.first_use import compile_loops
     from experiments.console import progress
     from experiments.options import check_fetch_path
     from experiments.tables import print_table
@@ -36,7 +37,9 @@ def command(
         raise unknown("level", level, ("l1", "l2"), "--level")
     machine = presets.load(gpu, overrides)
     opened = open_trace(trace)
-    with progress(f"bounding {level} of {machine.name}") as bar:
+    with progress("compiling the simulator") as bar:
+        compile_loops(lane_address=opened.is_lane_address)
+        bar.describe(f"bounding {level} of {machine.name}")
         found = belady(
             opened, machine, level, fetch_path=fetch_path, layout=layout, progress=bar.update
         )

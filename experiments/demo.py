@@ -56,7 +56,10 @@ def command(
     if mesh is not None:
         input_file(mesh)
     maps = scene_arguments(str(mesh or scene_names[0]), None, albedo_map, normal_map)
+    from concurrent.futures import ThreadPoolExecutor
+
     from cachesim import presets
+    from cachesim.first_use import compile_loops
 
     machines = [presets.load(name) for name in parse_names(gpus, "--gpus")]
     with clock.stage("loading the libraries"):
@@ -69,11 +72,16 @@ def command(
 
     folder = output_folder(output)
     opened = open_device(device)
-    with progress("rendering the scenes"), clock.stage("scenes"):
-        gbuffers = {
-            name: load_scene(str(mesh or name), width, height, device=opened, **of_mesh(name))
-            for name in scene_names
-        }
+    # The simulator compiles on its first use, while the OpenCL device draws the scenes.
+    with ThreadPoolExecutor(1) as pool:
+        compiling = pool.submit(compile_loops)
+        with progress("rendering the scenes"), clock.stage("scenes"):
+            gbuffers = {
+                name: load_scene(str(mesh or name), width, height, device=opened, **of_mesh(name))
+                for name in scene_names
+            }
+        with progress("compiling the simulator"), clock.stage("compiling, beside the scenes"):
+            compiling.result()
     seconds = estimate_s(list(gbuffers.values()), len(machines))
     remark(f"{width}x{height} on {opened.name}: about {seconds:,.0f} s on two cores")
     results: list[SceneResult] = []

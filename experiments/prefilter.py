@@ -26,6 +26,7 @@ def command(
     output: Folder = Path("out"),
 ) -> None:
     """Compare mip 0 with Eq 5.12: miss rates per scene, sample count, planes and scale."""
+    from cachesim.first_use import compile_loops
     from experiments.console import progress, remark
     from experiments.options import parse_image_size
     from experiments.output import output_folder
@@ -54,7 +55,8 @@ def command(
     remark(f"{size} on {opened.name}: about {seconds:,.0f} s on two cores")
     frames = []
     num_cases = len(list(study.cases(numbers)))
-    with progress("starting", len(names) * num_cases) as bar:
+    with progress("compiling the simulator", len(names) * num_cases) as bar:
+        compile_loops()
 
         def step(text: str) -> None:
             bar.advance()

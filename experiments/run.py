@@ -40,11 +40,14 @@ def command(
         if path is not None:
             output_file(path)
     from cachesim import presets, simulate
+    from cachesim.first_use import compile_loops
     from traces.open import open_trace
 
     machine = presets.load(gpu, overrides)
     opened = open_trace(trace)
-    with progress(f"counting on {machine.name}") as bar:
+    with progress("compiling the simulator") as bar:
+        compile_loops(lane_address=opened.is_lane_address)
+        bar.describe(f"counting on {machine.name}")
         report = simulate(
             opened, machine, fetch_path=fetch_path, layout=layout, progress=bar.update
         )

@@ -38,7 +38,9 @@ def command(
     output_file(output, ".csv")
     check_fetch_path(fetch_path)
     from cachesim import presets, sweep
+    from cachesim.first_use import compile_loops
     from traces.errors import InputError
+    from traces.open import open_trace
 
     machine = presets.load(gpu, overrides)
     axes: dict[str, list[object]] = {}
@@ -49,7 +51,10 @@ def command(
         axes[field] = values
     num_points = math.prod(len(values) for values in axes.values())
     done: list[dict[str, object]] = []
-    with progress(f"counting {num_points} configurations", num_points) as bar:
+    with progress("compiling the simulator", num_points) as bar:
+        # Once here, and not in every process.
+        compile_loops(lane_address=open_trace(trace).is_lane_address)
+        bar.describe(f"counting {num_points} configurations")
         try:
             frame = sweep(
                 trace,

@@ -24,8 +24,8 @@ from traces.trace import Chunk, Instruction, Launch, Trace, from_chunks
 
 SETS = st.sampled_from([1, 2, 3, 16])
 POLICIES = st.sampled_from(["lru", "fifo", "tree-plru", "random", "srrip"])
-WRITES = st.sampled_from(["read-only", "write-through", "write-back", "write-evict"])
-ALLOCATIONS = st.sampled_from(["none", "write-allocate", "fetch-on-write", "lazy-fetch-on-read"])
+WRITES = st.sampled_from(["write-back", "write-back", "write-through", "write-evict", "read-only"])
+ALLOCATIONS = st.sampled_from(["lazy-fetch-on-read", "fetch-on-write", "write-allocate", "none"])
 
 
 @st.composite
@@ -77,9 +77,14 @@ def small_gpus(draw) -> Gpu:
     return presets.with_fields(base, fields)
 
 
-@settings(max_examples=40)
+@settings(max_examples=60)
 @given(
-    st.one_of(texel_traces(max_rows_per_warp=2, max_side=100), lane_address_traces(2)),
+    # A few KiB, so that lines come back and are shared.
+    st.one_of(
+        texel_traces(max_rows_per_warp=6, max_side=24, bilinear=False),
+        texel_traces(max_rows_per_warp=2, max_side=60),
+        lane_address_traces(max_rows_per_warp=5, address_bits=11),
+    ),
     small_gpus(),
     st.sampled_from(FETCH_PATHS),
 )
