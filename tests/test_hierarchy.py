@@ -77,7 +77,7 @@ def small_gpus(draw) -> Gpu:
     return presets.with_fields(base, fields)
 
 
-@settings(max_examples=60)
+@settings(max_examples=120)
 @given(
     # A few KiB, so that lines come back and are shared.
     st.one_of(
@@ -275,6 +275,33 @@ def test_a_write_back_belongs_to_the_pass_that_dirtied_the_sector() -> None:
     assert (first.writebacks, first.dirty_at_end) == (0, 0)
     assert (second.writebacks, second.dirty_at_end) == (0, sectors)
     assert (first.hits, second.hits) == (0, sectors)
+
+
+def test_a_line_that_two_passes_dirtied_is_written_back_as_theirs() -> None:
+    """The first writes sectors 0 and 2 of each line, the second sector 1; loads push them out."""
+    written, read = Texture("written", "RGBA16F", 512, 1), Texture("read", "RGBA16F", 512, 64)
+    chunks, launches = [], []
+    for k, sectors in enumerate(([0, 2], [1])):
+        x = np.flatnonzero(np.isin(np.arange(512) // 4 % 4, sectors))
+        lanes = pack_texel(0, np.zeros_like(x), x).reshape(-1, 32)
+        index = np.full(len(lanes), k, np.uint16)
+        chunks.append(Chunk(k, 0, np.array([0, len(lanes)]), index, lanes))
+        launches.append(Launch(0, f"pass {k}", 1, 1))
+    for chunk in pixel_pass(read).chunks():
+        index = np.full_like(chunk.instruction, 2)
+        chunks.append(dataclasses.replace(chunk, launch=2, instruction=index))
+    launches.append(dataclasses.replace(pixel_pass(read).launches[0], pass_name="pass 2"))
+    kinds = ((0, "store"), (0, "store"), (1, "load"))
+    instructions = [Instruction(f"pass {k}", *kind) for k, kind in enumerate(kinds)]
+    trace = from_chunks(chunks, [written, read], instructions, launches)
+    fields = {f"{level}.sector_bytes": 32 for level in ("l1", "gl1", "l2", "llc")}
+    fields |= {"llc.line_bytes": 128, "llc.capacity": 1 << 20}
+    fields |= {"l2.capacity": 16 * 128 * 4, "l2.ways": 4}
+    gpu = presets.with_fields(presets.load("rx-6900-xt"), fields)
+    report = simulate(trace, gpu, layout="row-major")
+    for level, counter in (("l2", "writebacks"), ("llc", "writes"), ("llc", "dirty_at_end")):
+        found = {p.pass_name: getattr(p.counters[level], counter) for p in report.parts}
+        assert found == {"pass 0": 2 * 32, "pass 1": 32, "pass 2": 0}, (level, counter)
 
 
 def test_plain_loads_go_around_the_l1_of_the_paper_s_tool() -> None:
