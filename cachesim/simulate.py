@@ -26,6 +26,12 @@ from traces.trace import Chunk, Trace
 FETCH_PATHS: tuple[FetchPath, ...] = ("texture", "readonly", "global")
 Progress = Callable[[int], None]
 
+#: What of a trace's manifest a report repeats.
+_IDENTIFYING = (
+    "name", "scene", "attribution", "width", "height", "method", "num_frames", "traced_frames",
+    "seed", "device", "differing_fetches",
+)  # fmt: skip
+
 
 def simulate(
     trace: Trace,
@@ -199,7 +205,7 @@ class _Model:
             gpu=gpu.name,
             trace={
                 k: manifest[k]
-                for k in ("name", "scene", "method", "size", "frames", "seed")
+                for k in _IDENTIFYING
                 if k in manifest
             },
             fetch_path=self._fetch_path,
