@@ -16,6 +16,7 @@ from cachesim.counts import (
     BYPASSED_WRITES,
     BYPASSES,
     DIRTY,
+    DIRTY_SHIFT,
     HIT_BACK,
     HIT_EVICT,
     HITS,
@@ -24,12 +25,14 @@ from cachesim.counts import (
     MISS_LAZY,
     MISS_NONE,
     PARTIAL,
+    PARTIAL_SHIFT,
     POPCOUNT,
     REQUESTS,
     SECTOR_MISSES,
     STORES_DOWN,
     USED,
     VALID,
+    VALID_SHIFT,
     WRITE_FILLS,
     WRITE_MISSES,
     WRITEBACKS,
@@ -45,7 +48,7 @@ from cachesim.lookup import (
     take_small,
     touch_small,
 )
-from cachesim.stream import ATOMIC, GROUP_BITS, GROUP_MASK, LOAD, STORE
+from cachesim.stream import ATOMIC, GROUP_BITS, GROUP_MASK, LOAD, NO_OPERATION, STORE
 
 U64, U32, U8 = np.uint64, np.uint32, np.uint8
 
@@ -207,10 +210,12 @@ def _add_loads(counters, meta, looked_up, asked, hits, line_misses):  # type: ig
 @compiled
 def access_hashed(state, rules, requests, sets, counters, outcome):  # type: ignore[no-untyped-def]
     """`cache.access` with hashed look-up."""
-    tags, links, flags, rrpv = state.tags, state.links, state.flags, state.rrpv
+    tags, links, rrpv = state.tags, state.links, state.rrpv
+    flags, words = state.flags, state.flag_words
     newest, fills, tree, buckets = state.newest, state.fills, state.tree, state.bucket
     lines, masks, metas, all_down = requests.line, requests.mask, requests.meta, outcome.down
-    policy, can_be_dirty, bypass_loads = rules.policy, rules.can_be_dirty, rules.bypass_loads
+    policy = rules.policy
+    load_code = U32(NO_OPERATION if rules.bypass_loads else LOAD)
     ways = U64(rules.ways)
     num_buckets = U64(len(buckets) // rules.num_instances)
     shift = U64(64)
@@ -229,7 +234,7 @@ def access_hashed(state, rules, requests, sets, counters, outcome):  # type: ign
                 run = meta
                 looked_up, asked, hits, line_misses = 0, 0, 0, 0
             cache_set = first_set + U64(sets[i])
-            if bypass_loads or meta >> U32(GROUP_BITS) != U32(LOAD):
+            if meta >> U32(GROUP_BITS) != load_code:
                 _other_request(
                     state, rules, requests, i, first_bucket, shift, cache_set, counters, outcome
                 )
@@ -241,22 +246,20 @@ def access_hashed(state, rules, requests, sets, counters, outcome):  # type: ign
             line = find_hashed(tags, links, buckets, bucket, number)
             if line != NO_LINE:
                 policies.touch(policy, line, cache_set, ways, links, rrpv, newest, tree)
-                at = line * U64(4)
-                valid = flags[at + VALID]
+                word = U64(words[line])
+                valid = (word >> VALID_SHIFT) & U64(255)
                 hits += POPCOUNT[valid & mask]
-                all_down[i] = mask & ~valid
-                flags[at + VALID] = valid | mask
-                flags[at + PARTIAL] &= ~mask
+                all_down[i] = U64(mask) & ~valid
+                words[line] = (word | (U64(mask) << VALID_SHIFT)) & ~(U64(mask) << PARTIAL_SHIFT)
             else:
                 line = take_hashed(
                     tags, links, flags, rrpv, newest, fills, tree, buckets, policy, ways, bucket,
                     first_bucket, shift, cache_set,
                 )  # fmt: skip
-                at = line * U64(4)
-                if can_be_dirty and flags[at + DIRTY]:
+                if words[line] >> DIRTY_SHIFT:
                     _evict(state, rules, line, tags[line * U64(3)], i, counters, outcome)
                 tags[line * U64(3)] = number
-                flags[at + USED], flags[at + VALID], flags[at + PARTIAL] = 1, mask, 0
+                words[line] = U64(1) | (U64(mask) << VALID_SHIFT)
                 line_misses += count
                 all_down[i] = mask
         _add_loads(counters, run, looked_up, asked, hits, line_misses)
@@ -265,9 +268,9 @@ def access_hashed(state, rules, requests, sets, counters, outcome):  # type: ign
 @compiled
 def access_small(state, rules, requests, sets, counters, outcome, num_tags):  # type: ignore[no-untyped-def]
     """`cache.access` with small sets."""
-    small_tags, recency, flags = state.small_tags, state.recency, state.flags
+    small_tags, recency, words = state.small_tags, state.recency, state.flag_words
     lines, masks, metas, all_down = requests.line, requests.mask, requests.meta, outcome.down
-    can_be_dirty, bypass_loads = rules.can_be_dirty, rules.bypass_loads
+    load_code = U32(NO_OPERATION if rules.bypass_loads else LOAD)
     touches = rules.policy == policies.LRU
     ways, first_line = U64(rules.ways), U64(rules.first_line)
     for segment in range(len(requests.instance)):
@@ -281,7 +284,7 @@ def access_small(state, rules, requests, sets, counters, outcome, num_tags):  # 
                 run = meta
                 looked_up, asked, hits, line_misses = 0, 0, 0, 0
             cache_set = first_set + U64(sets[i])
-            if bypass_loads or meta >> U32(GROUP_BITS) != U32(LOAD):
+            if meta >> U32(GROUP_BITS) != load_code:
                 _other_request(
                     state, rules, requests, i, U64(0), U64(63), cache_set, counters, outcome
                 )
@@ -294,21 +297,19 @@ def access_small(state, rules, requests, sets, counters, outcome, num_tags):  # 
             if line != NO_LINE:
                 if touches:
                     touch_small(recency, line, cache_set)
-                at = line * U64(4)
-                valid = flags[at + VALID]
+                word = U64(words[line])
+                valid = (word >> VALID_SHIFT) & U64(255)
                 hits += POPCOUNT[valid & mask]
-                all_down[i] = mask & ~valid
-                flags[at + VALID] = valid | mask
-                flags[at + PARTIAL] &= ~mask
+                all_down[i] = U64(mask) & ~valid
+                words[line] = (word | (U64(mask) << VALID_SHIFT)) & ~(U64(mask) << PARTIAL_SHIFT)
             else:
                 line = take_small(recency, ways, cache_set)
-                at = line * U64(4)
-                if can_be_dirty and flags[at + DIRTY]:
+                if words[line] >> DIRTY_SHIFT:
                     _evict(
                         state, rules, line, U64(small_tags[line]) + first_line, i, counters, outcome
                     )
                 small_tags[line] = tag
-                flags[at + USED], flags[at + VALID], flags[at + PARTIAL] = 1, mask, 0
+                words[line] = U64(1) | (U64(mask) << VALID_SHIFT)
                 line_misses += count
                 all_down[i] = mask
         _add_loads(counters, run, looked_up, asked, hits, line_misses)

@@ -63,8 +63,9 @@ class CacheState(NamedTuple):
     """The arrays of all instances of a level. L = lines in all, S = sets in all, B = hash buckets
     in all.
 
-    flags: (4 L,) uint8, 4 l + `USED`, `VALID`, `PARTIAL`, `DIRTY`. bytes_held: (L, 8) uint32 bytes
-        of each partial sector; owner: (L, 8) int32 group that dirtied a sector.
+    flags: (4 L,) uint8, 4 l + `USED`, `VALID`, `PARTIAL`, `DIRTY`; flag_words: (L,) uint32, the
+        same. bytes_held: (L, 8) uint32 bytes of each partial sector; owner: (L, 8) int32 group that
+        dirtied a sector.
     Hashed: 24 bytes per line, in two views, so that what a miss needs of its victim comes with one
         fetch. tags: (3 L,) uint64, 3 l is the line number that line l holds. links: (6 L,) uint32,
         6 l + `lookup.CHAIN` is the next line of its hash chain, 6 l + `policies.NEWER` and `OLDER`
@@ -77,6 +78,7 @@ class CacheState(NamedTuple):
     """
 
     flags: npt.NDArray[np.uint8]
+    flag_words: npt.NDArray[np.uint32]
     bytes_held: npt.NDArray[np.uint32]
     owner: npt.NDArray[np.int32]
     tags: npt.NDArray[np.uint64]
@@ -154,9 +156,10 @@ def empty_state(rules: CacheRules) -> CacheState:
     per_instance = rules.num_sets * rules.ways
     buckets = 1 << max(4, (8 * per_instance - 1).bit_length())
     stores = 0 if rules.bypass_stores else lines
-    memory = np.zeros(3 * hashed_lines, np.uint64)
+    memory, flag_words = np.zeros(3 * hashed_lines, np.uint64), np.zeros(lines, np.uint32)
     state = CacheState(
-        flags=np.zeros(4 * lines, np.uint8),
+        flags=flag_words.view(np.uint8),
+        flag_words=flag_words,
         bytes_held=np.zeros((stores, 8), np.uint32),
         owner=np.zeros((stores, 8), np.int32),
         tags=memory,

@@ -28,5 +28,7 @@ MISS_NONE, MISS_ALLOCATE, MISS_FETCH, MISS_LAZY = range(4)
 # Places in a line's four flag bytes: whether it holds a tag, its readable sectors, those written in
 # part and not readable, those to write back.
 USED, VALID, PARTIAL, DIRTY = np.uint64(0), np.uint64(1), np.uint64(2), np.uint64(3)
+#: The same in the word that the four bytes are to the hot loops (little-endian hosts).
+VALID_SHIFT, PARTIAL_SHIFT, DIRTY_SHIFT = np.uint64(8), np.uint64(16), np.uint64(24)
 
 POPCOUNT = np.array([bin(m).count("1") for m in range(256)], np.int64)

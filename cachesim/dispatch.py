@@ -16,9 +16,8 @@ from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit
 
-from cachesim.compiled import inlined
+from cachesim.compiled import compiled, inlined
 from cachesim.config import SM
 from traces.errors import InputError
 from traces.trace import Chunk, Launch
@@ -81,7 +80,7 @@ def _place(  # type: ignore[no-untyped-def]
     cta_at[sm, place] = cta
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _fill_first(  # type: ignore[no-untyped-def]
     warps_per_cta,
     num_places,
@@ -112,7 +111,7 @@ def _fill_first(  # type: ignore[no-untyped-def]
                 )
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _issue(  # type: ignore[no-untyped-def]
     warps_per_cta,
     units,
@@ -320,7 +319,7 @@ class Dispatcher:
         self._lanes, self._instruction = lanes, instruction
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _join(  # type: ignore[no-untyped-def]
     offsets, lanes, instruction, warps_per_cta, inactive, out_offsets, out_lanes, out_instruction
 ):

@@ -16,10 +16,10 @@ from queue import SimpleQueue
 from typing import Any
 
 import numpy as np
-from numba import njit
 
 from cachesim import cache
 from cachesim.coalesce import Placement, Program, coalesce, new_scratch
+from cachesim.compiled import compiled
 from cachesim.dispatch import IssuedRows
 from cachesim.level import Buffer, Level
 from cachesim.route import pass_down
@@ -34,7 +34,7 @@ _NUM_BATCHES = 3
 _U64 = np.uint64
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def _segments_of_positions(position, count, instance_of, out_segments, out_instance):  # type: ignore[no-untyped-def]
     """Runs of requests from the same upper segment, and the lower instance of each. Returns how
     many runs.

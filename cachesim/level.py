@@ -233,7 +233,7 @@ class Buffer:
     def __init__(self, level: Level, num_requests: int, num_segments: int) -> None:
         self.requests = _room(num_requests, num_requests, num_segments)
         self.sets = np.empty(num_requests, np.uint32)
-        self.position = np.empty(num_requests, np.int64)
+        self.position = np.empty(num_requests, np.uint32)
         self.outcome = cache.empty_outcome(level.rules, num_requests)
         self.where = np.empty(num_requests if level.by_slice else 0, np.uint32)
         self.by_slice = _room(num_requests, 0, 0) if level.by_slice else None

@@ -108,16 +108,13 @@ def touch_small(recency, line, cache_set):  # type: ignore[no-untyped-def]
     """Move a line's way to the newest place."""
     order = recency[cache_set]
     way = U64(line) & U64(SMALL_WAYS - 1)
-    if order & U64(15) != way:
-        # The lowest 4 bits equal to the way: subtracting borrows out of zero digits first.
-        other = order ^ (way * _EACH)
-        zero = (other - _EACH) & ~other & _HIGH
-        lowest = zero & (~zero + U64(1))
-        place = _BIT_PLACE[(lowest * _DE_BRUIJN) >> U64(58)] & U64(60)
-        newer = (U64(1) << place) - U64(1)
-        recency[cache_set] = (
-            (order & ~((newer << U64(4)) | U64(15))) | ((order & newer) << U64(4)) | way
-        )
+    # The lowest 4 bits equal to the way: subtracting borrows out of zero digits first.
+    other = order ^ (way * _EACH)
+    zero = (other - _EACH) & ~other & _HIGH
+    newer = ((zero & (~zero + U64(1))) >> U64(3)) - U64(1)
+    recency[cache_set] = (
+        (order & ~((newer << U64(4)) | U64(15))) | ((order & newer) << U64(4)) | way
+    )
 
 
 @inlined

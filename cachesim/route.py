@@ -8,9 +8,8 @@ that a store needs, then the write-back of the line it evicted.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
-from cachesim.compiled import inlined
+from cachesim.compiled import compiled, inlined
 from cachesim.stream import ATOMIC, GROUP_BITS, GROUP_MASK, LOAD, STORE, Outcome, Requests
 
 U64, U32 = np.uint64, np.uint32
@@ -31,7 +30,7 @@ def _scaled_bytes(bits, upper_sector_bytes, lower_sector_bytes, part, lower_all)
     return scaled & U32(lower_all)
 
 
-@njit(cache=True, nogil=True)
+@compiled
 def pass_down(  # type: ignore[no-untyped-def]
     requests,
     outcome,
@@ -49,26 +48,29 @@ def pass_down(  # type: ignore[no-untyped-def]
     """Write the next level's requests into line, mask, meta, written, bytes_written; returns
     (requests, stores) written.
 
-    position: (n,) int64, the segment of the batch that each came from. The output arrays hold at
+    position: (n,) uint32, the segment of the batch that each came from. The output arrays hold at
         least `bound_passed_down` entries. Lower sectors divide upper ones.
     """
     sectors = upper_line_bytes // upper_sector_bytes
     parts = upper_sector_bytes // lower_sector_bytes
     lower_all = U32((U64(1) << U64(min(32, lower_sector_bytes))) - U64(1))
     same = upper_line_bytes == lower_line_bytes and parts == 1
+    lines, metas, all_down = requests.line, requests.meta, outcome.down
     num, stores = U64(0), 0
     for k in range(len(requests.order)):
         segment = requests.order[k]
         begin, end = U64(requests.segments[segment]), U64(requests.segments[segment + 1])
         for i in range(begin, end):
-            operation = requests.meta[i] >> U32(GROUP_BITS)
-            group = requests.meta[i] & U32(GROUP_MASK)
-            down = outcome.down[i]
+            down = all_down[i]
+            code = metas[i]
+            operation = code >> U32(GROUP_BITS)
+            group = code & U32(GROUP_MASK)
             if same and operation == LOAD:
-                if down:
-                    line[num], mask[num], meta[num] = requests.line[i], down, requests.meta[i]
-                    position[num] = segment
-                    num += U64(1)
+                # Written in any case and kept where something goes down: a branch would be guessed
+                # wrong often.
+                line[num], mask[num], meta[num] = lines[i], down, code
+                position[num] = segment
+                num += U64(down != 0)
             else:
                 fill = np.uint8(0)
                 if operation != LOAD and len(outcome.fill):

@@ -203,11 +203,7 @@ class _Model:
         manifest = self._trace.manifest
         return Report(
             gpu=gpu.name,
-            trace={
-                k: manifest[k]
-                for k in _IDENTIFYING
-                if k in manifest
-            },
+            trace={k: manifest[k] for k in _IDENTIFYING if k in manifest},
             fetch_path=self._fetch_path,
             layout=self._layout,
             num_rows=hierarchy.num_rows,

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-LOAD, STORE, ATOMIC = range(3)
+LOAD, STORE, ATOMIC, NO_OPERATION = range(4)
 OPERATION_CODES = {"load": LOAD, "store": STORE, "atomic": ATOMIC}
 
 #: Bits of `Requests.meta` below the operation code: the group.
