@@ -122,7 +122,7 @@ def figures_table(frame: pd.DataFrame) -> Table:
     notes = (
         machine_line(),
         f"stream: L1 and L2 counting on {GPU} of a coalesced stream in memory, one thread, "
-        "set-up and "
+        "median of 3 runs, set-up and "
         "coalescing excluded, all planes. pipeline: rendered, recorded and counted with no file "
         "between; "
         "peak of the whole process. file: Parquet with full provenance.",

@@ -29,6 +29,8 @@ from traces.synthetic import scatter
 from traces.trace import Chunk, Trace, from_chunks
 
 NUM_FRAMES = 8
+#: Runs of the counted stream; the median counts.
+NUM_RUNS = 3
 
 
 def timed(trace: Trace) -> tuple[Trace, dict[str, float]]:
@@ -58,9 +60,15 @@ def measure_stream(gbuffer: GBuffer, method: Method, gpu: str) -> dict[str, Any]
         live.launches,
     )
     compile_loops()
-    report = simulate(held, gpu, threaded=False)
-    counting = sum(s for name, s in report.timings.items() if name in ("l1", "route", "l2"))
+    reports = [simulate(held, gpu, threaded=False) for _ in range(NUM_RUNS)]
+    report = sorted(reports, key=_counting_s)[NUM_RUNS // 2]
+    counting = _counting_s(report)
     return _row(report, counting, counting) | {"stages": dict(report.timings)}
+
+
+def _counting_s(report: Report) -> float:
+    """Host seconds of counting: L1, L2 and the way between them."""
+    return sum(s for name, s in report.timings.items() if name in ("l1", "route", "l2"))
 
 
 def measure_pipeline(gbuffer: GBuffer, method: Method, gpu: str) -> dict[str, Any]:
