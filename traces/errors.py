@@ -11,7 +11,8 @@ class InputError(ValueError):
 def unknown(what: str, name: str, known: Iterable[str], where: str = "") -> InputError:
     """An `InputError` for an unknown name, with the nearest match and every allowed one."""
     known = sorted(known)
-    nearest = difflib.get_close_matches(name, known, n=1, cutoff=0.5)
+    begun = [candidate for candidate in known if name and candidate.startswith(name)]
+    nearest = begun[:1] or difflib.get_close_matches(name, known, n=1, cutoff=0.5)
     hint = f"did you mean {nearest[0]!r}? " if nearest else ""
     place = f"{where}: " if where else ""
     return InputError(f"{place}unknown {what} {name!r}; {hint}choose from {', '.join(known)}")
