@@ -1,0 +1,43 @@
+"""Which folder compiled loops are cached in."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+from traces.compiled_code import source_hash
+
+ROOT = Path(__file__).resolve().parent.parent
+
+
+def packages(root: Path) -> Path:
+    for name in ("traces", "cachesim", "kernels"):
+        (root / name).mkdir(parents=True)
+        (root / name / "a.py").write_text(f"{name} = 1\n")
+    return root
+
+
+def test_any_change_of_any_source_changes_the_folder(tmp_path: Path) -> None:
+    root = packages(tmp_path)
+    before = source_hash(root)
+    assert source_hash(root) == before
+    (root / "cachesim" / "a.py").write_text("cachesim = 2\n")
+    changed = source_hash(root)
+    (root / "traces" / "a.py").rename(root / "traces" / "b.py")
+    assert len({before, changed, source_hash(root)}) == 3
+
+
+def cache_folder(environment: dict[str, str]) -> str:
+    code = "import cachesim, numba; print(numba.config.CACHE_DIR)"
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True
+    )
+    return done.stdout.strip()
+
+
+def test_numba_caches_under_the_hash_unless_the_user_chose_a_folder(tmp_path: Path) -> None:
+    environment = {k: v for k, v in os.environ.items() if k != "NUMBA_CACHE_DIR"}
+    environment["XDG_CACHE_HOME"] = str(tmp_path)
+    expected = tmp_path / "sss-cachesim" / source_hash(ROOT)
+    assert cache_folder(environment) == str(expected)
+    assert cache_folder(environment | {"NUMBA_CACHE_DIR": "/chosen"}) == "/chosen"
