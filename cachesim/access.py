@@ -44,7 +44,7 @@ from cachesim.lookup import (
     bucket_of,
     find_hashed,
     find_small,
-    take_hashed,
+    move_line,
     take_small,
     touch_small,
 )
@@ -119,7 +119,7 @@ def _store(state, rules, line, mask, group, operation, written, bytes_written): 
 
 @compiled
 def _other_request(  # type: ignore[no-untyped-def]
-    state, rules, requests, i, first_bucket, shift, cache_set, counters, outcome
+    state, rules, requests, i, first_bucket, shift, cache_set, counters, outcome, others
 ):
     """A store, an atomic, or a load that bypasses."""
     number, mask = requests.line[i], requests.mask[i]
@@ -154,19 +154,16 @@ def _other_request(  # type: ignore[no-untyped-def]
         counters[group, HITS] += hits
         counters[group, SECTOR_MISSES] += count - hits
         counters[group, WRITE_MISSES] += count - hits
-        if not rules.small:
+        if rules.small:
+            if rules.policy == policies.LRU:
+                touch_small(state.recency, line, cache_set)
+        elif others is not None:
             policies.touch(
-                rules.policy,
-                line,
-                cache_set,
-                U64(rules.ways),
-                state.links,
-                state.rrpv,
-                state.newest,
-                state.tree,
-            )
+                rules.policy, line, cache_set, U64(rules.ways), state.links, state.rrpv,
+                state.newest, state.tree,
+            )  # fmt: skip
         elif rules.policy == policies.LRU:
-            touch_small(state.recency, line, cache_set)
+            policies.to_front(line, cache_set, state.links, state.newest)
     else:
         counters[group, LINE_MISSES] += count
         counters[group, WRITE_MISSES] += count
@@ -178,10 +175,16 @@ def _other_request(  # type: ignore[no-untyped-def]
             old = U64(state.small_tags[line]) + U64(rules.first_line)
             state.small_tags[line] = tag
         else:
-            line = take_hashed(
-                state.tags, state.links, flags, state.rrpv, state.newest, state.fills, state.tree,
-                state.bucket, rules.policy, U64(rules.ways), bucket, first_bucket, shift, cache_set,
-            )  # fmt: skip
+            if others is None:
+                line = policies.oldest_to_front(cache_set, state.links, state.newest)
+            else:
+                line = policies.victim(
+                    rules.policy, cache_set, U64(rules.ways), state.links, state.rrpv, state.newest,
+                    state.fills, state.tree,
+                )  # fmt: skip
+            move_line(
+                state.tags, state.links, flags, state.bucket, line, bucket, first_bucket, shift
+            )
             old = state.tags[line * U64(3)]
             state.tags[line * U64(3)] = number
         at = line * U64(4)
@@ -208,13 +211,16 @@ def _add_loads(counters, meta, looked_up, asked, hits, line_misses):  # type: ig
 
 
 @compiled
-def access_hashed(state, rules, requests, sets, counters, outcome):  # type: ignore[no-untyped-def]
-    """`cache.access` with hashed look-up."""
+def access_hashed(state, rules, requests, sets, counters, outcome, others):  # type: ignore[no-untyped-def]
+    """`cache.access` with hashed look-up.
+
+    others: None for LRU and FIFO, which numba then compiles without the other policies; else 1.
+    """
     tags, links, rrpv = state.tags, state.links, state.rrpv
     flags, words = state.flags, state.flag_words
     newest, fills, tree, buckets = state.newest, state.fills, state.tree, state.bucket
     lines, masks, metas, all_down = requests.line, requests.mask, requests.meta, outcome.down
-    policy = rules.policy
+    policy, touches = rules.policy, rules.policy == policies.LRU
     load_code = U32(NO_OPERATION if rules.bypass_loads else LOAD)
     ways = U64(rules.ways)
     num_buckets = U64(len(buckets) // rules.num_instances)
@@ -236,8 +242,9 @@ def access_hashed(state, rules, requests, sets, counters, outcome):  # type: ign
             cache_set = first_set + U64(sets[i])
             if meta >> U32(GROUP_BITS) != load_code:
                 _other_request(
-                    state, rules, requests, i, first_bucket, shift, cache_set, counters, outcome
-                )
+                    state, rules, requests, i, first_bucket, shift, cache_set, counters, outcome,
+                    others,
+                )  # fmt: skip
                 continue
             count = POPCOUNT[mask]
             looked_up += 1
@@ -245,17 +252,23 @@ def access_hashed(state, rules, requests, sets, counters, outcome):  # type: ign
             bucket = bucket_of(number, first_bucket, shift)
             line = find_hashed(tags, links, buckets, bucket, number)
             if line != NO_LINE:
-                policies.touch(policy, line, cache_set, ways, links, rrpv, newest, tree)
+                if others is not None:
+                    policies.touch(policy, line, cache_set, ways, links, rrpv, newest, tree)
+                elif touches:
+                    policies.to_front(line, cache_set, links, newest)
                 word = U64(words[line])
                 valid = (word >> VALID_SHIFT) & U64(255)
                 hits += POPCOUNT[valid & mask]
                 all_down[i] = U64(mask) & ~valid
                 words[line] = (word | (U64(mask) << VALID_SHIFT)) & ~(U64(mask) << PARTIAL_SHIFT)
             else:
-                line = take_hashed(
-                    tags, links, flags, rrpv, newest, fills, tree, buckets, policy, ways, bucket,
-                    first_bucket, shift, cache_set,
-                )  # fmt: skip
+                if others is None:
+                    line = policies.oldest_to_front(cache_set, links, newest)
+                else:
+                    line = policies.victim(
+                        policy, cache_set, ways, links, rrpv, newest, fills, tree
+                    )
+                move_line(tags, links, flags, buckets, line, bucket, first_bucket, shift)
                 if words[line] >> DIRTY_SHIFT:
                     _evict(state, rules, line, tags[line * U64(3)], i, counters, outcome)
                 tags[line * U64(3)] = number
@@ -286,7 +299,7 @@ def access_small(state, rules, requests, sets, counters, outcome, num_tags):  # 
             cache_set = first_set + U64(sets[i])
             if meta >> U32(GROUP_BITS) != load_code:
                 _other_request(
-                    state, rules, requests, i, U64(0), U64(63), cache_set, counters, outcome
+                    state, rules, requests, i, U64(0), U64(63), cache_set, counters, outcome, None
                 )
                 continue
             count = POPCOUNT[mask]

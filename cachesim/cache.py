@@ -229,7 +229,8 @@ def access(
     if rules.small:
         access_small(state, rules, requests, sets, counters, outcome, np.uint64(SMALL_WAYS))
     else:
-        access_hashed(state, rules, requests, sets, counters, outcome)
+        others = None if rules.policy in (policies.LRU, policies.FIFO) else 1
+        access_hashed(state, rules, requests, sets, counters, outcome, others)
 
 
 __all__ = [

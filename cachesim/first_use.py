@@ -13,7 +13,7 @@ _PRESETS = ("titan-x-pascal", "rx-5700-xt", "h100-sxm")
 
 
 def compile_loops(*, lane_address: bool = False) -> None:
-    """Run every loop once on a handful of fetches: about 12 s the first time on a machine, cached
+    """Run every loop once on a handful of fetches: about 10 s the first time on a machine, cached
     after.
 
     lane_address: for traces of byte addresses, whose loops are compiled apart.

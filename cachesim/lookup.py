@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from cachesim import policies
 from cachesim.compiled import inlined
 
 U64, U32 = np.uint64, np.uint32
@@ -55,26 +54,10 @@ def find_hashed(tags, links, buckets, bucket, number):  # type: ignore[no-untype
 
 
 @inlined
-def take_hashed(  # type: ignore[no-untyped-def]
-    tags,
-    links,
-    used,
-    rrpv,
-    newest,
-    fills,
-    tree,
-    buckets,
-    policy,
-    ways,
-    bucket,
-    first_bucket,
-    shift,
-    cache_set,
-):
-    """Give a line of the set to a new tag, in the hash table and the ring; the caller sets the tag,
-    the old one is still there.
+def move_line(tags, links, used, buckets, line, bucket, first_bucket, shift):  # type: ignore[no-untyped-def]
+    """Take a line out of the chain of its old tag, still there, and put it into `bucket`'s;
+    the caller sets the new tag.
     """
-    line = policies.victim(policy, cache_set, ways, links, rrpv, newest, fills, tree)
     if used[line * U64(4)]:
         old = bucket_of(tags[line * U64(3)], first_bucket, shift)
         other = buckets[old]
@@ -86,7 +69,6 @@ def take_hashed(  # type: ignore[no-untyped-def]
             links[other * U64(6) + CHAIN] = links[line * U64(6) + CHAIN]
     links[line * U64(6) + CHAIN] = buckets[bucket]
     buckets[bucket] = line
-    return line
 
 
 @inlined

@@ -39,7 +39,7 @@ NEWER, OLDER = U64(3), U64(4)
 
 
 @inlined
-def _to_front(line, cache_set, links, newest):  # type: ignore[no-untyped-def]
+def to_front(line, cache_set, links, newest):  # type: ignore[no-untyped-def]
     """Make `line` the newest of its set's ring. OLDER walks back in time; what is newer than the
     newest is the oldest.
     """
@@ -54,6 +54,14 @@ def _to_front(line, cache_set, links, newest):  # type: ignore[no-untyped-def]
         links[line * U64(6) + NEWER] = oldest
         links[oldest * U64(6) + OLDER] = line
         newest[cache_set] = line
+
+
+@inlined
+def oldest_to_front(cache_set, links, newest):  # type: ignore[no-untyped-def]
+    """The oldest line of the set's ring, made its newest: the ring turns by one."""
+    line = links[newest[cache_set] * U64(6) + NEWER]
+    newest[cache_set] = line
+    return line
 
 
 @inlined
@@ -94,7 +102,7 @@ def _pointed_way(ways, cache_set, tree):  # type: ignore[no-untyped-def]
 def touch(policy, line, cache_set, ways, links, rrpv, newest, tree):  # type: ignore[no-untyped-def]
     """A present line was accessed."""
     if policy == LRU:
-        _to_front(line, cache_set, links, newest)
+        to_front(line, cache_set, links, newest)
     elif policy == TREE_PLRU:
         _point_away(U64(line) - U64(cache_set) * ways, ways, cache_set, tree)
     elif policy == SRRIP:
@@ -108,9 +116,7 @@ def victim(policy, cache_set, ways, links, rrpv, newest, fills, tree):  # type: 
     """
     first = U64(cache_set) * ways
     if policy == LRU or policy == FIFO:
-        line = links[newest[cache_set] * U64(6) + NEWER]
-        newest[cache_set] = line
-        return line
+        return oldest_to_front(cache_set, links, newest)
     count = fills[cache_set]
     fills[cache_set] = count + U64(1)
     if count < ways:
