@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from cachesim.compiled import compiled, inlined
-from cachesim.stream import ATOMIC, GROUP_BITS, GROUP_MASK, LOAD, STORE, Outcome, Requests
+from cachesim.stream import GROUP_BITS, GROUP_MASK, LOAD, STORE
 
 U64, U32 = np.uint64, np.uint32
 
@@ -204,6 +204,3 @@ def _append(  # type: ignore[no-untyped-def]
             )
             bytes_written[stores - 1, lower_sector] = scaled
     return num, stores
-
-
-__all__ = ["ATOMIC", "Outcome", "Requests", "pass_down"]

@@ -5,7 +5,6 @@ trace ──► place texels ──► dispatch ──► coalesce ──► L1 
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 
@@ -13,12 +12,12 @@ import numpy as np
 
 from cachesim import cache, presets
 from cachesim.coalesce import groups_of, placement_of, program_of
-from cachesim.config import L1, CacheLevel, FetchPath, Gpu
+from cachesim.config import L1, FetchPath, Gpu
 from cachesim.dispatch import Dispatcher
 from cachesim.hierarchy import BATCH_ROWS, Hierarchy
 from cachesim.level import Level
 from cachesim.report import DramCounters, LevelCounters, Part, Report
-from traces.errors import InputError, unknown
+from traces.errors import unknown
 from traces.placement import place
 from traces.texture import MAX_MIPS
 from traces.trace import Chunk, Trace
@@ -227,9 +226,6 @@ def hierarchy_levels(
     (all, where sliced).
 
     The first entry of the second list is the number of L1 units per SM.
-
-    Raises:
-        InputError: a level's sectors do not divide those of the level above.
     """
     l1: L1 = gpu.l1_texture if fetch_path == "texture" and gpu.l1_texture is not None else gpu.l1
     skips = fetch_path == "global" and gpu.l1.bypass_loads
@@ -258,19 +254,7 @@ def hierarchy_levels(
                 Level(name, config, 1, num_groups, is_last=is_last, byte_range=byte_range)
             )
             sharing.append(units)
-    for upper, lower in itertools.pairwise(levels):
-        _check_sectors(gpu, upper.name, upper.config, lower.name, lower.config)
     return levels, sharing
-
-
-def _check_sectors(
-    gpu: Gpu, upper_name: str, upper: CacheLevel, lower_name: str, lower: CacheLevel
-) -> None:
-    if upper.sector_bytes % lower.sector_bytes:
-        raise InputError(
-            f"{gpu.name}: {lower_name}.sector_bytes = {lower.sector_bytes}: must divide "
-            f"{upper_name}.sector_bytes = {upper.sector_bytes}"
-        )
 
 
 def _counters(level: Level, groups: slice, dirty_at_end: int) -> LevelCounters:
