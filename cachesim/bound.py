@@ -19,17 +19,12 @@ import numpy as np
 import numpy.typing as npt
 
 from cachesim import cache, presets
-from cachesim.coalesce import groups_of, placement_of, program_of
 from cachesim.config import Gpu
-from cachesim.dispatch import Dispatcher
-from cachesim.hierarchy import BATCH_ROWS, Hierarchy
 from cachesim.level import Level
 from cachesim.optimal import LineStream
-from cachesim.simulate import FETCH_PATHS, hierarchy_levels
+from cachesim.stages import Stages
 from cachesim.stream import GROUP_BITS, LOAD, Outcome, Requests
 from traces.errors import WorkError, unknown
-from traces.placement import place
-from traces.texture import MAX_MIPS
 from traces.trace import Trace
 
 LEVELS = ("l1", "l2")
@@ -92,77 +87,41 @@ def belady(
         WorkError: no room for the temporary files.
     """
     gpu = presets.load(gpu) if isinstance(gpu, str) else gpu
-    path = fetch_path or (gpu.lane_address_path if trace.is_lane_address else "texture")
-    if path not in FETCH_PATHS:
-        raise unknown("fetch path", path, FETCH_PATHS)
     if level not in LEVELS:
         raise unknown("level", level, LEVELS)
-    texel_layout = None if trace.is_lane_address else layout or gpu.texture_layout
-    address_map = place(trace.textures, texel_layout) if texel_layout else None
-    num_groups = max(1, len(groups_of(trace))) * MAX_MIPS
-    levels, units = hierarchy_levels(gpu, path, num_groups)
-    index = [above.name for above in levels].index(level)
+    recorded: list[_RecordedLevel] = []
+
+    def up_to_recorded(levels: list[Level]) -> list[Level]:
+        index = [above.name for above in levels].index(level)
+        recorded.append(_RecordedLevel(levels[index], stream))
+        return [*levels[:index], recorded[0]]
+
+    def at_launch_end() -> None:
+        if level == "l1":
+            recorded[0].end_stream()
+
     try:
         with LineStream() as stream:
-            recorded = _RecordedLevel(levels[index], stream)
-            hierarchy = Hierarchy(
-                [*levels[:index], recorded],
-                [1, *units[1 : index + 1]],
-                program_of(trace),
-                placement_of(address_map),
-                warp_size=gpu.sm.warp_size,
-                texel_range=(address_map.base_address, address_map.footprint_bytes)
-                if address_map
-                else None,
-                num_groups=num_groups,
-                threaded=True,
+            stages = Stages(
+                trace,
+                gpu,
+                fetch_path,
+                layout,
+                levels_of=up_to_recorded,
+                at_launch_end=at_launch_end,
             )
             try:
-                _run(trace, gpu, units[0], hierarchy, recorded, progress)
+                for chunk in trace.chunks():
+                    stages.add(chunk)
+                    if progress is not None:
+                        progress(stages.num_lane_fetches)
+                stages.finish()
             finally:
-                hierarchy.close()
-            recorded.end_stream()
+                stages.close()
+            recorded[0].end_stream()
     except OSError as error:
         raise WorkError(f"temporary files of the line stream: {error.strerror}") from error
-    return recorded.bound()
-
-
-def _run(
-    trace: Trace,
-    gpu: Gpu,
-    units_per_sm: int,
-    hierarchy: Hierarchy,
-    recorded: _RecordedLevel,
-    progress: Callable[[int], None] | None,
-) -> None:
-    """Send the trace through the levels, as `simulate` does."""
-    dtype = np.uint64 if trace.is_lane_address else np.uint32
-    dispatcher = Dispatcher(gpu.sm, units_per_sm, dtype, BATCH_ROWS)
-    launch = -1
-
-    def issue() -> None:
-        while (rows := dispatcher.issue()) is not None:
-            hierarchy.process(rows)
-
-    def end_launch() -> None:
-        dispatcher.finish()
-        issue()
-        hierarchy.end_launch()
-        if hierarchy.levels[0] is recorded:
-            recorded.end_stream()
-
-    for chunk in trace.chunks():
-        if chunk.launch != launch:
-            if launch >= 0:
-                end_launch()
-            launch = chunk.launch
-            dispatcher.begin(trace.launches[launch])
-        dispatcher.add(chunk)
-        issue()
-        if progress is not None:
-            progress(int(hierarchy.lane_fetches.sum()))
-    if launch >= 0:
-        end_launch()
+    return recorded[0].bound()
 
 
 class _RecordedLevel(Level):

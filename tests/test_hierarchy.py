@@ -16,7 +16,7 @@ from strategies import lane_address_traces, texel_traces, traces
 from cachesim import Gpu, presets, simulate, simulate_all
 from cachesim.coalesce import groups_of
 from cachesim.level import Level
-from cachesim.simulate import FETCH_PATHS
+from cachesim.stages import FETCH_PATHS
 from cachesim.stream import GROUP_BITS, LOAD
 from traces.synthetic import gather, pixel_pass, scatter, stream
 from traces.texture import MAX_MIPS, Texture, pack_texel
