@@ -1,4 +1,4 @@
-"""GPU configuration: what the counting model needs of a machine, checked once and immutable after.
+"""GPU configuration: what the models need of a machine, checked once and immutable after.
 
 Sizes are integers in bytes here; TOML files and overrides may write "48 KiB" (`cachesim.units`). A
 preset file gives every field as `{ value, source, confidence }`; `cachesim.presets` keeps the
@@ -12,6 +12,15 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
+from cachesim.timing_config import (
+    CacheTiming,
+    DramTiming,
+    Icnt,
+    L1TextureTiming,
+    L1Timing,
+    L2Timing,
+    SmTiming,
+)
 from cachesim.units import parse_size
 
 #: Bounds keep addresses, and the models' tables, within what a machine can hold.
@@ -223,6 +232,7 @@ class Gpu(_Model):
     l1_texture: a separate texture L1 (the `-gpgpusim` presets), used by fetch path "texture".
     texture_layout: the texel layout of sampled textures, a name in `traces.layout.LAYOUTS`.
     lane_address_path: the fetch path of a lane-address trace unless told otherwise.
+    sm_timing to dram_timing: what the timing model needs besides; counting does without them.
     """
 
     name: str
@@ -237,6 +247,14 @@ class Gpu(_Model):
     l2: L2
     llc: LLC | None = None
     dram: Dram
+    sm_timing: SmTiming | None = None
+    l1_timing: L1Timing | None = None
+    l1_texture_timing: L1TextureTiming | None = None
+    gl1_timing: CacheTiming | None = None
+    icnt: Icnt | None = None
+    l2_timing: L2Timing | None = None
+    llc_timing: CacheTiming | None = None
+    dram_timing: DramTiming | None = None
 
     @model_validator(mode="after")
     def _levels_fit(self) -> Self:
