@@ -1,0 +1,372 @@
+"""Memory channels: a fixed delay, then first-ready first-come first-served over banks and rows.
+
+The rules are those of facts sheet sections 3.3 to 3.5: open pages; one row or one column command a
+command cycle, both with a dual bus; credits bound what a slice may have in flight.
+"""
+
+from __future__ import annotations
+
+from cachesim.compiled import compiled
+from cachesim.stream import LOAD
+from cachesim.timing.access import DOWN, drop_request
+from cachesim.timing.records import MAX_DRAM_BANKS, NEVER, WRITEBACK
+from cachesim.timing.slice import come_back
+
+_LINK = 3
+
+
+@compiled
+def _bits(address, positions):  # type: ignore[no-untyped-def]
+    """The number that an address's bits at `positions` make up, the lowest first."""
+    value, k = 0, 0
+    while positions[k] >= 0:
+        value |= ((address >> positions[k]) & 1) << k
+        k += 1
+    return value
+
+
+@compiled
+def place(state, request):  # type: ignore[no-untyped-def]
+    """Bank and row of a request (facts sheet 3.4)."""
+    machine = state.pool.machine[0]
+    one = state.pool.requests[request]
+    address = one.address
+    shift = machine.channel_shift
+    rest = ((address >> shift) // machine.num_channels) << shift | (address & ((1 << shift) - 1))
+    bank = _bits(rest, state.memory.bits[0])
+    one.bank = bank
+    one.row = _bits(rest, state.memory.bits[1])
+
+
+@compiled
+def _has_credit(machine, channel, sub):  # type: ignore[no-untyped-def]
+    return channel.private_credit[sub] < 1 or channel.shared_credit < machine.shared_credits
+
+
+@compiled
+def _borrow(channel, sub):  # type: ignore[no-untyped-def]
+    if channel.private_credit[sub] < 1:
+        channel.private_credit[sub] += 1
+    else:
+        channel.shared_credit += 1
+
+
+@compiled
+def _give_back(channel, sub):  # type: ignore[no-untyped-def]
+    if channel.private_credit[sub] > 0:
+        channel.private_credit[sub] -= 1
+    else:
+        channel.shared_credit -= 1
+
+
+@compiled
+def _return_oldest(state, tags, index):  # type: ignore[no-untyped-def]
+    """Pass one finished read to its slice."""
+    machine = state.pool.machine[0]
+    memory = state.memory
+    channel = memory.channels[index]
+    if channel.return_count == 0:
+        return
+    room = memory.return_ring.shape[1] - 1
+    request = memory.return_ring[index, channel.return_head & room]
+    node = state.pool.requests[request].lower
+    if tags.nodes[node].fill_count >= tags.level[0].queue_fill:
+        return
+    come_back(tags, state.pool, node, request)
+    tags.nodes[node].wake = min(tags.nodes[node].wake, machine.now)
+    _give_back(channel, node % machine.subslices)
+    channel.return_head += 1
+    channel.return_count -= 1
+
+
+@compiled
+def _finish_data(state, index):  # type: ignore[no-untyped-def]
+    """The oldest column command's data is there."""
+    machine = state.pool.machine[0]
+    memory = state.memory
+    channel = memory.channels[index]
+    if channel.data_count == 0 or channel.return_count >= machine.return_queue:
+        return
+    room = memory.data_ring.shape[1] - 1
+    at = channel.data_head & room
+    if memory.data_time[index, at] > machine.tick:
+        return
+    request = memory.data_ring[index, at]
+    channel.data_head += 1
+    channel.data_count -= 1
+    one = state.pool.requests[request]
+    one.pending -= 1
+    if one.pending > 0:
+        return
+    if one.kind == WRITEBACK:
+        _give_back(channel, one.lower % machine.subslices)
+        machine.queued_dram -= 1
+        drop_request(state.pool, request)
+        return
+    machine.queued_dram -= 1
+    if one.source < 4:
+        one.source = 4
+    to = memory.return_ring.shape[1] - 1
+    memory.return_ring[index, (channel.return_head + channel.return_count) & to] = request
+    channel.return_count += 1
+
+
+@compiled
+def _serve_bank(state, index):  # type: ignore[no-untyped-def]
+    """Give one idle bank its next request: the oldest of its open row, or the oldest."""
+    machine = state.pool.machine[0]
+    memory = state.memory
+    channel = memory.channels[index]
+    requests = state.pool.requests
+    num_banks = machine.num_dram_banks
+    for k in range(num_banks):
+        b = k + channel.priority
+        if b >= num_banks:
+            b -= num_banks
+        bank = memory.banks[index * MAX_DRAM_BANKS + b]
+        if bank.serving >= 0 or bank.first < 0:
+            continue
+        chosen, before = bank.first, -1
+        if machine.fr_fcfs and bank.open_row >= 0:
+            at, previous = bank.first, -1
+            while at >= 0 and requests[at].row != bank.open_row:
+                previous = at
+                at = requests[at].next[_LINK]
+            if at >= 0:
+                chosen, before = at, previous
+                machine.row_hits += 1
+        following = requests[chosen].next[_LINK]
+        if before < 0:
+            bank.first = following
+        else:
+            requests[before].next[_LINK] = following
+        if bank.last == chosen:
+            bank.last = before
+        bank.serving = chosen
+        bank.left = requests[chosen].pending
+        channel.pending -= 1
+        channel.num_serving += 1
+        channel.priority = channel.priority + 1 if channel.priority + 1 < num_banks else 0
+        return True
+    return False
+
+
+@compiled
+def _column_command(state, index):  # type: ignore[no-untyped-def]
+    """Issue a read or write burst to the first bank that may."""
+    machine = state.pool.machine[0]
+    memory = state.memory
+    channel = memory.channels[index]
+    tick = machine.tick
+    if channel.ccd > tick:
+        return False
+    num_banks = machine.num_dram_banks
+    for k in range(num_banks):
+        b = k + channel.priority
+        if b >= num_banks:
+            b -= num_banks
+        bank = memory.banks[index * MAX_DRAM_BANKS + b]
+        if bank.serving < 0:
+            continue
+        one = state.pool.requests[bank.serving]
+        if bank.open_row != one.row:
+            continue
+        group = memory.groups[index * MAX_DRAM_BANKS + (b & machine.group_mask)]
+        if group.ccdl > tick:
+            continue
+        if one.write:
+            if bank.rcdwr > tick or channel.rtw > tick:
+                continue
+            channel.is_writing = 1
+            channel.wtr = tick + machine.wtr
+            bank.wtp = tick + machine.wtp
+            delay = machine.wl
+            machine.dram_writes += 1
+        else:
+            if bank.rcd > tick or channel.wtr > tick:
+                continue
+            channel.is_writing = 0
+            channel.rtw = tick + machine.rtw
+            bank.rtp = tick + machine.rtpl
+            group.rtpl = tick + machine.rtpl
+            delay = machine.cl
+            machine.dram_reads += 1
+        channel.ccd = tick + machine.ccd
+        group.ccdl = tick + machine.ccdl
+        room = memory.data_ring.shape[1] - 1
+        at = (channel.data_head + channel.data_count) & room
+        memory.data_ring[index, at] = bank.serving
+        memory.data_time[index, at] = tick + delay
+        channel.data_count += 1
+        bank.left -= 1
+        if bank.left == 0:
+            bank.serving = -1
+            channel.num_serving -= 1
+        return True
+    return False
+
+
+@compiled
+def _row_command(state, index):  # type: ignore[no-untyped-def]
+    """Open a row, or close one that is not the one asked for."""
+    machine = state.pool.machine[0]
+    memory = state.memory
+    channel = memory.channels[index]
+    tick = machine.tick
+    num_banks = machine.num_dram_banks
+    for k in range(num_banks):
+        b = k + channel.priority
+        if b >= num_banks:
+            b -= num_banks
+        bank = memory.banks[index * MAX_DRAM_BANKS + b]
+        if bank.serving < 0:
+            continue
+        row = state.pool.requests[bank.serving].row
+        if bank.open_row < 0:
+            if channel.rrd <= tick and bank.rp <= tick and bank.rc <= tick:
+                bank.open_row = row
+                channel.rrd = tick + machine.rrd
+                bank.rcd = tick + machine.rcd
+                bank.rcdwr = tick + machine.rcdwr
+                bank.ras = tick + machine.ras
+                bank.rc = tick + machine.rc
+                channel.priority = b + 1 if b + 1 < num_banks else 0
+                machine.activates += 1
+                return True
+        elif bank.open_row != row:
+            group = memory.groups[index * MAX_DRAM_BANKS + (b & machine.group_mask)]
+            if bank.ras <= tick and bank.wtp <= tick and bank.rtp <= tick and group.rtpl <= tick:
+                bank.open_row = -1
+                bank.rp = tick + machine.rp
+                channel.priority = b + 1 if b + 1 < num_banks else 0
+                machine.precharges += 1
+                return True
+    return False
+
+
+@compiled
+def _enter(state, index):  # type: ignore[no-untyped-def]
+    """Move what waits at the controller's door into the banks' lists."""
+    memory = state.memory
+    channel = memory.channels[index]
+    requests = state.pool.requests
+    room = memory.entry_ring.shape[1] - 1
+    while channel.entry_count > 0:
+        request = memory.entry_ring[index, channel.entry_head & room]
+        channel.entry_head += 1
+        channel.entry_count -= 1
+        one = requests[request]
+        one.next[_LINK] = -1
+        bank = memory.banks[index * MAX_DRAM_BANKS + one.bank]
+        if bank.first < 0:
+            bank.first = request
+        else:
+            requests[bank.last].next[_LINK] = request
+        bank.last = request
+        channel.pending += 1
+
+
+@compiled
+def _take_from_slices(state, tags, index):  # type: ignore[no-untyped-def]
+    """Take one request of the channel's slices into the fixed delay, slices in turn."""
+    machine = state.pool.machine[0]
+    memory = state.memory
+    channel = memory.channels[index]
+    for k in range(machine.subslices):
+        sub = (k + channel.last_borrower + 1) % machine.subslices
+        node = index * machine.subslices + sub
+        home = tags.nodes[node]
+        if home.down_count == 0 or not _has_credit(machine, channel, sub):
+            continue
+        if channel.pending >= machine.dram_queue:
+            return
+        request = tags.queues[node, DOWN, home.down_head & (tags.queues.shape[2] - 1)]
+        home.down_head += 1
+        home.down_count -= 1
+        home.wake = min(home.wake, machine.now)
+        one = state.pool.requests[request]
+        one.lower = node
+        one.pending = machine.bursts
+        place(state, request)
+        _borrow(channel, sub)
+        channel.last_borrower = sub
+        room = memory.latency_ring.shape[1] - 1
+        at = (channel.latency_head + channel.latency_count) & room
+        memory.latency_ring[index, at] = request
+        memory.latency_time[index, at] = machine.now + machine.fixed_latency
+        channel.latency_count += 1
+        machine.queued_dram += 1
+        return
+
+
+@compiled
+def _leave_delay(state, index):  # type: ignore[no-untyped-def]
+    machine = state.pool.machine[0]
+    memory = state.memory
+    channel = memory.channels[index]
+    if channel.latency_count == 0 or channel.pending >= machine.dram_queue:
+        return
+    room = memory.latency_ring.shape[1] - 1
+    at = channel.latency_head & room
+    if memory.latency_time[index, at] > machine.now:
+        return
+    request = memory.latency_ring[index, at]
+    channel.latency_head += 1
+    channel.latency_count -= 1
+    to = memory.entry_ring.shape[1] - 1
+    memory.entry_ring[index, (channel.entry_head + channel.entry_count) & to] = request
+    channel.entry_count += 1
+
+
+@compiled
+def step_channel(state, tags, index):  # type: ignore[no-untyped-def]
+    """One command cycle of one channel. `tags`: the level above it."""
+    machine = state.pool.machine[0]
+    channel = state.memory.channels[index]
+    _return_oldest(state, tags, index)
+    _finish_data(state, index)
+    if channel.entry_count > 0:
+        _enter(state, index)
+    if channel.pending > 0:
+        _serve_bank(state, index)
+    if channel.num_serving > 0:
+        if machine.dual_bus:
+            _column_command(state, index)
+            _row_command(state, index)
+        elif not _column_command(state, index):
+            _row_command(state, index)
+    _take_from_slices(state, tags, index)
+    _leave_delay(state, index)
+
+
+@compiled
+def is_idle(state, tags, index):  # type: ignore[no-untyped-def]
+    """Whether a channel has nothing to do until a slice asks."""
+    machine = state.pool.machine[0]
+    channel = state.memory.channels[index]
+    if (
+        channel.entry_count
+        + channel.pending
+        + channel.num_serving
+        + channel.data_count
+        + channel.return_count
+        > 0
+    ):
+        return False
+    for sub in range(machine.subslices):
+        if tags.nodes[index * machine.subslices + sub].down_count > 0:
+            return False
+    return True
+
+
+@compiled
+def next_delay(state, index):  # type: ignore[no-untyped-def]
+    """The core cycle in which the oldest delayed request may enter; `NEVER` if there is none."""
+    channel = state.memory.channels[index]
+    if channel.latency_count == 0:
+        return NEVER
+    room = state.memory.latency_ring.shape[1] - 1
+    return state.memory.latency_time[index, channel.latency_head & room]
+
+
+__all__ = ["LOAD", "is_idle", "next_delay", "step_channel"]

@@ -1,0 +1,473 @@
+"""Build the machine's state from a GPU's configuration.
+
+Gpu ──► rules and sizes (`records.MACHINE`, `records.LEVEL`) ──► empty arrays (`state.State`)
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from cachesim.address import partition_of, set_hash
+from cachesim.config import L2, CacheLevel, Gpu
+from cachesim.counts import (
+    HIT_BACK,
+    HIT_EVICT,
+    HIT_THROUGH,
+    MISS_ALLOCATE,
+    MISS_FETCH,
+    MISS_LAZY,
+    MISS_NONE,
+    NUM_COUNTERS,
+)
+from cachesim.timing import records
+from cachesim.timing.network import Network
+from cachesim.timing.records import (
+    MAX_BANKS,
+    MAX_DRAM_BANKS,
+    MAX_MEMORY_QUEUE,
+    MAX_SCHEDULERS,
+    MAX_SUBSLICES,
+    MAX_WARPS,
+    NEVER,
+    NUM_REASONS,
+)
+from cachesim.timing.state import Memory, Pool, Route, State, Work
+from cachesim.timing.tags import Tags
+from cachesim.timing_config import CacheTiming, L1Timing
+from traces.errors import InputError
+
+_ON_HIT = {
+    "read-only": HIT_THROUGH,
+    "write-through": HIT_THROUGH,
+    "write-back": HIT_BACK,
+    "write-evict": HIT_EVICT,
+    # Local write-back, global write-evict: a texel store is global.
+    "local-write-back": HIT_EVICT,
+}
+_ON_MISS = {
+    "none": MISS_NONE,
+    "write-allocate": MISS_ALLOCATE,
+    "fetch-on-write": MISS_FETCH,
+    "lazy-fetch-on-read": MISS_LAZY,
+}
+_FIRST_POOL = 1 << 14
+
+
+def power_of_two(number: int) -> int:
+    """The least power of two that is not below `number`."""
+    return 1 << max(0, number - 1).bit_length()
+
+
+def _log2(number: int) -> int:
+    return number.bit_length() - 1
+
+
+def check_timing(gpu: Gpu, fetch_path: str) -> None:
+    """Refuse a GPU that the timing model cannot run.
+
+    Raises:
+        InputError: a table is missing, or a size is above the model's.
+    """
+    needed = ["sm_timing", "l1_timing", "icnt", "l2_timing", "dram_timing"]
+    needed += ["gl1_timing"] if gpu.gl1 is not None else []
+    needed += ["llc_timing"] if gpu.llc is not None else []
+    if gpu.l1_texture is not None and fetch_path == "texture":
+        needed.append("l1_texture_timing")
+    missing = [name for name in needed if getattr(gpu, name) is None]
+    if missing:
+        raise InputError(f"{gpu.name}: timing needs the tables {', '.join(missing)}")
+    assert gpu.sm_timing and gpu.l1_timing and gpu.dram_timing
+    limits = (
+        ("sm.max_warps", gpu.sm.max_warps, MAX_WARPS),
+        ("sm_timing.num_schedulers", gpu.sm_timing.num_schedulers, MAX_SCHEDULERS),
+        ("sm_timing.memory_queue", gpu.sm_timing.memory_queue, MAX_MEMORY_QUEUE),
+        ("l1_timing.num_banks", gpu.l1_timing.num_banks, MAX_BANKS),
+        ("l2.slices_per_channel", gpu.l2.slices_per_channel, MAX_SUBSLICES),
+        ("dram_timing.num_banks", gpu.dram_timing.num_banks, MAX_DRAM_BANKS),
+    )
+    for field, value, most in limits:
+        if value > most:
+            raise InputError(f"{gpu.name}: {field} = {value}: timing allows up to {most}")
+    if gpu.l1_timing.num_banks & (gpu.l1_timing.num_banks - 1):
+        raise InputError(
+            f"{gpu.name}: l1_timing.num_banks = {gpu.l1_timing.num_banks}: need a power of two"
+        )
+    for name in ("l1", "gl1", "l2", "llc"):
+        level = getattr(gpu, name)
+        if level is not None and level.replacement not in ("lru", "fifo"):
+            raise InputError(
+                f"{gpu.name}: {name}.replacement = {level.replacement!r}: timing allows lru, fifo"
+            )
+        timing = getattr(gpu, f"{name}_timing")
+        if level is not None and timing.allocation != "on-miss":
+            if level.write_policy == "write-back":
+                raise InputError(
+                    f"{gpu.name}: {name}_timing.allocation = {timing.allocation!r}: a write-back "
+                    "cache must allocate on-miss"
+                )
+            if level.write_allocate in ("fetch-on-write", "lazy-fetch-on-read"):
+                raise InputError(
+                    f"{gpu.name}: {name}_timing.allocation = {timing.allocation!r}: "
+                    f"{level.write_allocate} must allocate on-miss"
+                )
+    if gpu.l1.write_policy == "write-back":
+        raise InputError(
+            f"{gpu.name}: l1.write_policy = 'write-back': timing allows the policies that keep no "
+            "dirty data in the L1"
+        )
+    last = gpu.llc or gpu.l2
+    if last.sector_bytes % gpu.dram_timing.atom_bytes:
+        raise InputError(
+            f"{gpu.name}: dram_timing.bus_bytes x burst_length = {gpu.dram_timing.atom_bytes} B "
+            f"does not divide the last cache's sector of {last.sector_bytes} B"
+        )
+
+
+def _level_rules(
+    index: int,
+    level: CacheLevel,
+    instances: int,
+    timing: L1Timing | CacheTiming,
+    core_hz: int,
+    room: int,
+) -> npt.NDArray[np.void]:
+    """The `records.LEVEL` of one level."""
+    rules = np.zeros(1, records.LEVEL)
+    one = rules[0]
+    one["index"] = index
+    one["num_instances"] = instances
+    one["line_shift"] = _log2(level.line_bytes)
+    one["sector_shift"] = _log2(level.sector_bytes)
+    one["sectors_per_line"] = level.sectors_per_line
+    one["sector_mask"] = level.sectors_per_line - 1
+    one["num_sets"], one["ways"] = level.num_sets, level.ways
+    one["touch_on_hit"] = level.replacement == "lru"
+    one["on_miss_allocation"] = timing.allocation == "on-miss"
+    one["on_hit"], one["on_store_miss"] = (
+        _ON_HIT[level.write_policy],
+        _ON_MISS[level.write_allocate],
+    )
+    one["is_read_only"] = level.write_policy == "read-only"
+    one["all_bytes"] = (1 << min(32, level.sector_bytes)) - 1
+    one["num_mshrs"], one["merge"] = timing.num_mshrs, timing.mshr_merge
+    one["miss_queue"] = timing.miss_queue
+    one["bucket_mask"] = power_of_two(2 * level.num_sets * level.ways) - 1
+    one["mshr_mask"] = power_of_two(2 * timing.num_mshrs) - 1
+    one["dirty_limit"] = timing.dirty_limit_percent
+    one["set_kind"] = set_hash(level).kind
+    one["width"] = 1
+    one["reserve_in"] = level.sectors_per_line
+    if isinstance(timing, CacheTiming):
+        cost = 256 * level.sector_bytes * core_hz // (timing.port_bytes * timing.clock_hz)
+        one["port_cost"] = one["fill_cost"] = max(1, cost)
+        one["width"] = max(1, 256 // max(1, cost))
+        one["latency"] = timing.latency_cycles
+        one["texture_latency"] = getattr(timing, "texture_latency_cycles", timing.latency_cycles)
+        one["queue_in"], one["queue_down"] = timing.queue_in, timing.queue_down
+        one["queue_fill"], one["queue_out"] = timing.queue_fill, timing.queue_out
+        one["delay_capacity"] = timing.queue_in + int(one["width"]) * (timing.latency_cycles + 2)
+    else:
+        cost = 256 * level.sector_bytes // timing.fill_bytes_per_cycle
+        one["fill_cost"] = max(1, cost)
+        one["latency"] = timing.latency_cycles
+    return rules
+
+
+def _tags(
+    index: int,
+    level: CacheLevel | None,
+    instances: int,
+    timing: Any,
+    core_hz: int,
+    num_groups: int,
+) -> Tags:
+    """The empty arrays of one level; of nothing where the level is absent."""
+    if level is None:
+        none = np.zeros(0, np.int32)
+        return Tags(
+            np.zeros(1, records.LEVEL), np.zeros(0, records.NODE), np.zeros(0, records.LINE),
+            none.view(np.uint32), none, np.zeros(0, records.SET), none, np.zeros(0, records.MSHR),
+            none, np.zeros((0, 256), np.uint32), np.zeros((num_groups, NUM_COUNTERS + 1), np.int64),
+            np.zeros((2, 6), np.int64), np.zeros((1, 6, 1), np.int32),
+        )  # fmt: skip
+    if isinstance(timing, CacheTiming):
+        widest = max(timing.queue_in, timing.queue_down, timing.queue_fill, timing.queue_out)
+        latency = max(timing.latency_cycles, 1)
+        room = power_of_two(8 * (widest + latency) + timing.miss_queue + 64)
+    else:
+        room = power_of_two(timing.miss_queue + 32)
+    rules = _level_rules(index, level, instances, timing, core_hz, room)
+    lines = instances * level.num_sets * level.ways
+    mshrs = instances * timing.num_mshrs
+    tags = Tags(
+        rules,
+        np.zeros(instances, records.NODE),
+        np.zeros(lines, records.LINE),
+        np.zeros(lines * level.sectors_per_line, np.uint32),
+        np.zeros(lines * level.sectors_per_line, np.int32),
+        np.zeros(instances * level.num_sets, records.SET),
+        np.full(instances * (int(rules[0]["bucket_mask"]) + 1), -1, np.int32),
+        np.zeros(mshrs, records.MSHR),
+        np.full(instances * (int(rules[0]["mshr_mask"]) + 1), -1, np.int32),
+        set_hash(level).table,
+        np.zeros((num_groups, NUM_COUNTERS + 1), np.int64),
+        np.zeros((2, 6), np.int64),
+        np.zeros((instances, 6, room), np.int32),
+    )
+    free = np.arange(mshrs, dtype=np.int32).reshape(instances, timing.num_mshrs)
+    following = free + 1
+    following[:, -1] = -1
+    tags.mshrs["ready_next"] = following.ravel()
+    tags.nodes["mshr_free"] = free[:, 0]
+    tags.nodes["ready_first"] = -1
+    tags.nodes["failed"] = -1
+    tags.nodes["wake"] = NEVER
+    forget_lines(tags)
+    return tags
+
+
+def forget_lines(tags: Tags) -> None:
+    """Empty every line of a level."""
+    ways = int(tags.level[0]["ways"])
+    line = np.arange(len(tags.lines), dtype=np.int32)
+    tags.lines["key"] = -1
+    tags.lines["set"] = line // ways
+    # Way 0 is the first to be given up.
+    tags.lines["newer"] = np.where(line % ways == ways - 1, -1, line + 1)
+    tags.lines["older"] = np.where(line % ways == 0, -1, line - 1)
+    for field in ("valid", "partial", "modified", "reserved"):
+        tags.lines[field] = 0
+    tags.sets["newest"] = np.arange(len(tags.sets)) * ways + ways - 1
+    tags.sets["oldest"] = np.arange(len(tags.sets)) * ways
+    tags.sets["reserved_lines"] = 0
+    tags.buckets[:] = -1
+    tags.nodes["dirty_lines"] = 0
+
+
+def _route(level: L2 | None) -> Route:
+    if level is None:
+        return Route(np.zeros(7, np.int64), np.zeros((0, 256), np.uint32))
+    part = partition_of(level)
+    numbers = [
+        part.num_channels, part.slices_per_channel, part.run_shift, part.hash.kind,
+        part.hash.size, part.xor, _log2(level.line_bytes),
+    ]  # fmt: skip
+    return Route(np.array(numbers, np.int64), part.hash.table)
+
+
+def _network(
+    inputs: int, outputs: int, input_packets: int, output_packets: int, latency: int, slack: int
+) -> Network:
+    in_room, out_room = power_of_two(input_packets + slack), power_of_two(output_packets + slack)
+    network = Network(
+        np.zeros(inputs, records.PORT),
+        np.zeros((inputs, in_room), np.int32),
+        np.zeros((inputs, in_room), np.int64),
+        np.zeros((inputs, in_room), np.int32),
+        np.zeros((inputs, in_room), np.int32),
+        np.zeros(outputs, records.OUTLET),
+        np.zeros((outputs, out_room), np.int32),
+        np.zeros((outputs, out_room), np.int64),
+        np.array([0, latency, 0, 0], np.int64),
+    )
+    network.outputs["stamp"] = -1
+    return network
+
+
+def _address_bits(address_map: str) -> npt.NDArray[np.int64]:
+    """Positions of the bank and row bits, lowest first, each list closed by -1."""
+    letters = [c for c in address_map.partition(";")[2] if c not in ".| "]
+    bits = np.full((2, 65), -1, np.int64)
+    for row, letter in enumerate("BR"):
+        positions = [63 - k for k, c in enumerate(letters) if c == letter]
+        bits[row, : len(positions)] = sorted(positions)
+    return bits
+
+
+def _memory(gpu: Gpu, channels: int) -> Memory:
+    timing = gpu.dram_timing
+    assert timing
+    room = power_of_two(timing.queue + timing.return_queue + 8 * MAX_SUBSLICES)
+    memory = Memory(
+        np.zeros(channels, records.CHANNEL),
+        np.zeros(channels * MAX_DRAM_BANKS, records.BANK),
+        np.zeros(channels * MAX_DRAM_BANKS, records.BANK_GROUP),
+        np.zeros((channels, room), np.int32),
+        np.zeros((channels, room), np.int64),
+        np.zeros((channels, room), np.int32),
+        np.zeros((channels, power_of_two(timing.cl + timing.wl + 4)), np.int32),
+        np.zeros((channels, power_of_two(timing.cl + timing.wl + 4)), np.int64),
+        np.zeros((channels, room), np.int32),
+        _address_bits(timing.address_map),
+    )
+    for field in ("serving", "open_row", "first", "last"):
+        memory.banks[field] = -1
+    memory.channels["wake"] = NEVER
+    return memory
+
+
+def build(gpu: Gpu, fetch_path: str, num_groups: int) -> State:
+    """The state of an idle machine.
+
+    num_groups: rows of the levels' counters.
+
+    Raises:
+        InputError: as `check_timing`.
+    """
+    check_timing(gpu, fetch_path)
+    sm, l1_timing, icnt, dram = gpu.sm_timing, gpu.l1_timing, gpu.icnt, gpu.dram_timing
+    assert sm and l1_timing and icnt and dram and gpu.l2_timing
+    fifo = gpu.l1_texture_timing if fetch_path == "texture" and gpu.l1_texture else None
+    l1 = gpu.l1_texture if fifo and gpu.l1_texture else gpu.l1
+    num_sms, units = gpu.sm.count, l1.units_per_sm
+    num_gl1 = -(-num_sms // gpu.gl1.sms_per_instance) if gpu.gl1 else 0
+    ports = num_gl1 or num_sms
+    last = gpu.llc or gpu.l2
+    latency = (
+        l1_timing.texture_latency_cycles if fetch_path == "texture" else l1_timing.latency_cycles
+    )
+    machine = np.zeros(1, records.MACHINE)
+    line_parts = max(1, l1.sector_bytes // gpu.l2.sector_bytes)
+    bl = dram.burst_cycles
+    rules = {
+        "num_sms": num_sms, "units": units, "num_schedulers": sm.num_schedulers,
+        "is_gto": sm.scheduler == "gto", "issue_per_warp": sm.issue_per_warp,
+        "different_units": sm.dual_issue_different_units, "int_on_fp32": sm.int_on_fp32,
+        "result_cycles": sm.result_cycles, "memory_cycles": sm.memory_cycles,
+        "memory_queue": sm.memory_queue, "collector_units": sm.collector_units,
+        "quads_per_cycle": sm.texture_quads_per_cycle, "lines_per_cycle": l1_timing.lines_per_cycle,
+        "bytes_per_cycle": l1_timing.bytes_per_cycle, "num_banks": l1_timing.num_banks,
+        "bank_shift": _log2(l1_timing.bank_bytes), "l1_latency": latency,
+        "bypass": fetch_path == "global" and gpu.l1.bypass_loads, "has_fifo_l1": fifo is not None,
+        "launch_cycles": sm.launch_cycles, "cta_launch_cycles": sm.cta_launch_cycles,
+        "ejection": icnt.ejection_packets, "response": icnt.response_packets, "num_ports": ports,
+        "num_slices": gpu.l2.num_slices, "num_gl1": num_gl1, "has_gl1": num_gl1 > 0,
+        "num_llc": gpu.llc.num_slices if gpu.llc else 0, "has_llc": gpu.llc is not None,
+        "num_channels": last.num_channels, "subslices": last.slices_per_channel,
+        "sms_per_gl1": gpu.gl1.sms_per_instance if gpu.gl1 else 1,
+        "output_queued": icnt.queueing == "output-queued", "match_again": icnt.inputs_match_again,
+        "flit_bytes": icnt.flit_bytes, "header_bytes": icnt.header_bytes,
+        "input_packets": icnt.input_packets, "output_packets": icnt.output_packets,
+        "l2_sector_shift": _log2(gpu.l2.sector_bytes), "llc_sector_shift": _log2(last.sector_bytes),
+        "core_hz": gpu.clock_hz, "dram_hz": dram.clock_hz,
+        "fixed_latency": dram.fixed_latency_cycles, "dram_queue": dram.queue,
+        "return_queue": dram.return_queue, "dual_bus": dram.dual_command_bus,
+        "fr_fcfs": dram.scheduler == "fr-fcfs", "num_dram_banks": dram.num_banks,
+        "group_mask": dram.num_bank_groups - 1, "bursts": last.sector_bytes // dram.atom_bytes,
+        "ccd": dram.ccd, "rrd": dram.rrd, "rcd": dram.rcd, "ras": dram.ras, "rp": dram.rp,
+        "rc": dram.rc, "cl": dram.cl, "wl": dram.wl, "ccdl": dram.ccdl, "rtpl": dram.rtpl,
+        # Facts sheet 3.4, derived timings.
+        "rcdwr": max(0, dram.rcd - (dram.wl + 1)), "rtw": dram.cl + bl + 2 - dram.wl,
+        "wtr": dram.wl + bl + dram.cdlr, "wtp": dram.wl + bl + dram.wr,
+        "shared_credits": dram.queue + dram.return_queue - (last.slices_per_channel - 1),
+        "channel_shift": int(dram.address_map.partition("@")[2].partition(";")[0]),
+        "sector_shift": _log2(l1.sector_bytes), "line_parts": line_parts,
+        "store_bytes": gpu.l1.sector_bytes, "last_sm": num_sms - 1,
+    }  # fmt: skip
+    if fifo:
+        rules |= {
+            "fragment_fifo": fifo.fragment_fifo, "request_fifo": fifo.request_fifo,
+            "rob": fifo.reorder_buffer, "result_fifo": fifo.result_fifo,
+        }  # fmt: skip
+    for name, value in rules.items():
+        machine[0][name] = value
+    tags = [
+        _tags(records.L1, l1, num_sms * units, l1_timing, gpu.clock_hz, num_groups),
+        _tags(records.GL1, gpu.gl1, num_gl1, gpu.gl1_timing, gpu.clock_hz, num_groups),
+        _tags(records.L2, gpu.l2, gpu.l2.num_slices, gpu.l2_timing, gpu.clock_hz, num_groups),
+        _tags(
+            records.LLC, gpu.llc, gpu.llc.num_slices if gpu.llc else 0, gpu.llc_timing,
+            gpu.clock_hz, num_groups,
+        ),
+    ]  # fmt: skip
+    # What one cycle can take from the pool at most.
+    machine[0]["num_pool"] = (
+        num_sms * units * l1_timing.num_banks
+        + sum(8 * int(t.level[0]["width"]) * len(t.nodes) for t in tags)
+        + gpu.l2.num_slices * line_parts * int(tags[2].level[0]["width"])
+        + 8 * gpu.l2.num_slices
+    )
+    pool_size = power_of_two(2 * int(machine[0]["num_pool"]) + _FIRST_POOL)
+    machine[0]["free_top"] = pool_size
+    sms = np.zeros(num_sms, records.SM)
+    sms["wake"] = NEVER
+    sms["last_reason"] = records.R_IDLE
+    sms["last_step"] = -1
+    sms["last_issued"] = -1
+    pipes = np.zeros(num_sms * units, records.PIPE)
+    for field in ("warp", "next_writeback", "next_global"):
+        pipes[field] = -1
+    pipes["bank_entered"] = -1
+    pipes["bank_failed"] = -1
+    masks = np.zeros(sm.num_schedulers, np.uint64)
+    for slot in range(MAX_WARPS):
+        masks[slot % sm.num_schedulers] |= np.uint64(1 << slot)
+    kinds = ("int", "fp32", "sfu", "control")
+    latencies = [
+        [getattr(sm, f"{kind}_latency_cycles"), getattr(sm, f"{kind}_initiation_cycles")]
+        for kind in kinds
+    ]
+    fifo_room = power_of_two(max(fifo.fragment_fifo, fifo.reorder_buffer) + 2) if fifo else 1
+    slack = 8 * (num_sms + gpu.l2.num_slices) if icnt.queueing == "output-queued" else 8
+    return State(
+        Pool(
+            np.zeros(pool_size, records.REQUEST), np.arange(pool_size, dtype=np.int32), machine,
+            np.tile(np.array([0, 0, NEVER], np.int64), (4, 1)),
+        ),
+        empty_work(),
+        np.array(latencies, np.int64),
+        sms,
+        pipes,
+        np.zeros(num_sms * MAX_WARPS, records.WARP),
+        *tags,
+        _network(
+            ports, gpu.l2.num_slices, icnt.input_packets, icnt.output_packets,
+            icnt.request_latency_cycles, slack,
+        ),
+        _network(
+            gpu.l2.num_slices, ports, icnt.input_packets, icnt.output_packets,
+            icnt.reply_latency_cycles, slack,
+        ),
+        _route(gpu.l2),
+        _route(gpu.llc),
+        _memory(gpu, last.num_channels),
+        np.zeros((num_sms * units * l1_timing.num_banks, power_of_two(latency + 1)), np.int32),
+        np.zeros((num_sms * units, power_of_two(icnt.response_packets + 1)), np.int32),
+        np.zeros((num_sms, power_of_two(icnt.ejection_packets + 64)), np.int32),
+        np.full((num_sms, 1), -1, np.int64),
+        np.zeros((num_sms, 1), np.int64),
+        np.zeros((num_sms * units, 3, fifo_room), np.int32),
+        masks,
+        np.zeros(NUM_REASONS, np.int64),
+        np.zeros((5, 2), np.int64),
+        np.zeros(5, np.int64),
+        np.zeros(1, np.int64),
+        np.zeros(5, np.int64),
+    )  # fmt: skip
+
+
+def empty_work() -> Work:
+    """No program, no rows."""
+    return Work(
+        np.zeros(0, records.INSTRUCTION), np.zeros(0, records.OPERATION),
+        np.zeros(1, records.ROW), np.zeros(1, np.int64), np.zeros(1, np.uint8),
+        np.zeros(1, np.int32), np.zeros(1, np.int64), np.zeros(1, np.uint32),
+        np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0, np.uint8),
+    )  # fmt: skip
+
+
+def larger_pool(state: State) -> State:
+    """The same state with twice as many requests in its pool."""
+    pool = state.pool
+    old = len(pool.requests)
+    requests = np.zeros(2 * old, records.REQUEST)
+    requests[:old] = pool.requests
+    free = np.zeros(2 * old, np.int32)
+    top = int(pool.machine[0]["free_top"])
+    free[:old] = np.arange(old, 2 * old)
+    free[old : old + top] = pool.free[:top]
+    pool.machine[0]["free_top"] = old + top
+    return state._replace(pool=pool._replace(requests=requests, free=free))

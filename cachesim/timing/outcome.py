@@ -1,0 +1,185 @@
+"""From the engine's sums to `results.PassTiming` and GPGPU-Sim's counters."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from cachesim.config import Gpu
+from cachesim.counts import ACCESSES, BYPASSES
+from cachesim.timing import records
+from cachesim.timing.records import KINDS, NEVER, OUTCOMES, R_MEMORY
+from cachesim.timing.results import REASONS, LevelTiming, PassTiming
+from cachesim.timing.state import State
+
+_DIRECT = {
+    "issue": records.R_ISSUE,
+    "arithmetic": records.R_ARITHMETIC,
+    "l1_bandwidth": records.R_L1_BANDWIDTH,
+    "l1_reservation": records.R_L1_RESERVATION,
+    "interconnect": records.R_INTERCONNECT,
+    "idle": records.R_IDLE,
+}
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """The engine's sums at one moment; two make a launch's share."""
+
+    now: int
+    reasons: npt.NDArray[np.int64]
+    waits: npt.NDArray[np.int64]
+    latency: npt.NDArray[np.int64]
+    issued: npt.NDArray[np.int64]
+    resident: int
+    served: tuple[int, ...]
+    dram: tuple[int, int]
+
+    @staticmethod
+    def take(state: State) -> Snapshot:
+        """Copy the sums."""
+        machine = state.pool.machine[0]
+        served = [
+            int(t.counters[:, ACCESSES].sum() + (t.counters[:, BYPASSES].sum() if k else 0))
+            for k, t in enumerate((state.l1, state.gl1, state.l2, state.llc))
+        ]
+        return Snapshot(
+            int(machine["now"]),
+            state.reasons.copy(),
+            state.pool.waits.copy(),
+            state.latency.copy(),
+            state.issued.copy(),
+            int(state.resident[0]),
+            tuple(served),
+            (int(machine["dram_reads"]), int(machine["dram_writes"])),
+        )
+
+
+def _shares(total: int, weights: dict[str, int]) -> dict[str, int]:
+    """Split `total` by weights; the remainders go to the largest."""
+    whole = sum(weights.values())
+    if whole == 0:
+        return {name: 0 for name in weights}
+    parts = {name: total * w // whole for name, w in weights.items()}
+    left = total - sum(parts.values())
+    for name in sorted(weights, key=lambda n: (-(total * weights[n] % whole), n))[:left]:
+        parts[name] += 1
+    return parts
+
+
+def _where(before: Snapshot, after: Snapshot, num_sms: int, launch: int) -> dict[str, int]:
+    """Reason -> cycles of one launch."""
+    spent = after.reasons - before.reasons
+    waits = after.waits - before.waits
+    least = np.where(after.waits[:, 2] < NEVER, after.waits[:, 2], 0)
+    queued = np.maximum(0, waits[:, 0] - waits[:, 1] * least)
+    latency = int((after.latency - before.latency)[:, 0].sum())
+    memory = {
+        "interconnect": int(queued[records.S_REQUEST] + queued[records.S_REPLY]),
+        "l2": int(queued[records.S_L2]),
+        "dram": int(queued[records.S_BELOW]),
+    }
+    memory["latency"] = max(0, latency - sum(memory.values()))
+    shared = _shares(int(spent[R_MEMORY]), memory)
+    sm_cycles = {name: int(spent[code]) for name, code in _DIRECT.items()}
+    for name, cycles in shared.items():
+        sm_cycles[name] = sm_cycles.get(name, 0) + cycles
+    # While the kernel is launched every SM is idle.
+    sm_cycles["idle"] = max(0, sm_cycles["idle"] - launch * num_sms)
+    cycles = _shares(after.now - before.now - launch, sm_cycles)
+    cycles["launch"] = launch
+    return {name: cycles.get(name, 0) for name in REASONS}
+
+
+def _peaks(gpu: Gpu) -> dict[str, int]:
+    """Bytes per 1000 core cycles that each level can move."""
+    assert gpu.l1_timing and gpu.l2_timing and gpu.dram_timing
+    l1, units = gpu.l1_timing, gpu.sm.count * gpu.l1.units_per_sm
+    per_unit = l1.num_banks * gpu.l1.sector_bytes
+    if l1.bytes_per_cycle:
+        per_unit = min(per_unit, l1.bytes_per_cycle)
+    peaks = {"l1": 1000 * units * per_unit}
+    if gpu.gl1 is not None and gpu.gl1_timing is not None:
+        arrays = -(-gpu.sm.count // gpu.gl1.sms_per_instance)
+        rate = gpu.gl1_timing.port_bytes * gpu.gl1_timing.clock_hz
+        peaks["gl1"] = 1000 * arrays * rate // gpu.clock_hz
+    rate = gpu.l2_timing.port_bytes * gpu.l2_timing.clock_hz
+    peaks["l2"] = 1000 * gpu.l2.num_slices * rate // gpu.clock_hz
+    if gpu.llc is not None and gpu.llc_timing is not None:
+        rate = gpu.llc_timing.port_bytes * gpu.llc_timing.clock_hz
+        peaks["llc"] = 1000 * gpu.llc.num_slices * rate // gpu.clock_hz
+    dram, channels = gpu.dram_timing, (gpu.llc or gpu.l2).num_channels
+    rate = channels * dram.bus_bytes * dram.data_rate * dram.clock_hz
+    peaks["dram"] = 1000 * rate // gpu.clock_hz
+    return peaks
+
+
+def passes_of(name: str, before: Snapshot, after: Snapshot, gpu: Gpu, state: State) -> PassTiming:
+    """The timing of one launch."""
+    assert gpu.sm_timing and gpu.dram_timing
+    launch = min(gpu.sm_timing.launch_cycles, after.now - before.now)
+    l1_bytes = state.l1.level[0]["sector_shift"]
+    sectors = {
+        "l1": 1 << int(l1_bytes),
+        "gl1": gpu.gl1.sector_bytes if gpu.gl1 else 0,
+        "l2": gpu.l2.sector_bytes,
+        "llc": gpu.llc.sector_bytes if gpu.llc else 0,
+    }
+    latency = after.latency - before.latency
+    peaks = _peaks(gpu)
+    levels = {}
+    for k, (level, size) in enumerate(sectors.items()):
+        if level in peaks:
+            levels[level] = LevelTiming(
+                (after.served[k] - before.served[k]) * size,
+                peaks[level],
+                int(latency[k, 0]),
+                int(latency[k, 1]),
+            )
+    bursts = sum(after.dram) - sum(before.dram)
+    levels["dram"] = LevelTiming(
+        bursts * gpu.dram_timing.atom_bytes, peaks["dram"], int(latency[4, 0]), int(latency[4, 1])
+    )
+    issued = after.issued - before.issued
+    return PassTiming(
+        name,
+        1,
+        after.now - before.now,
+        launch,
+        _where(before, after, gpu.sm.count, launch),
+        {kind: int(issued[k]) for k, kind in enumerate(KINDS[:5])},
+        after.resident - before.resident,
+        gpu.sm.count * (after.now - before.now - launch),
+        gpu.sm.max_warps,
+        levels,
+    )
+
+
+def raw_counters(state: State, launches: Sequence[PassTiming]) -> dict[str, dict[str, int]]:
+    """GPGPU-Sim's counters under its own names; those of stores with a leading "W_"."""
+    machine = state.pool.machine[0]
+    found: dict[str, dict[str, int]] = {}
+    for name, tags in (("l1", state.l1), ("l2", state.l2)):
+        found[name] = {outcome: int(tags.outcomes[0, k]) for k, outcome in enumerate(OUTCOMES)}
+        found[name] |= {
+            f"W_{outcome}": int(tags.outcomes[1, k]) for k, outcome in enumerate(OUTCOMES)
+        }
+    found["dram"] = {
+        "reads": int(machine["dram_reads"]),
+        "writes": int(machine["dram_writes"]),
+        "row_hits": int(machine["row_hits"]),
+        "activates": int(machine["activates"]),
+        "precharges": int(machine["precharges"]),
+    }
+    below = state.latency[1:].sum(axis=0)
+    found["sm"] = {
+        "gpu_sim_cycle": sum(one.cycles for one in launches),
+        "gpgpu_n_tot_w_icount": sum(sum(one.warp_instructions.values()) for one in launches),
+        "l1_bank_conflicts": int(machine["bank_conflicts"]),
+        "averagemflatency_sum": int(below[0]),
+        "averagemflatency_num": int(below[1]),
+    }
+    return found

@@ -1,0 +1,402 @@
+"""The load/store and texture pipe of an L1 unit: from a memory instruction's sectors to its
+registers.
+
+memory instruction ──► L1 banks (a delay, then the tags) ──► miss queue ──► interconnect
+registers ◄── write-back, one sector a cycle ◄── fill ◄── responses
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from cachesim.address import slice_and_line
+from cachesim.compiled import compiled
+from cachesim.counts import REQUESTS
+from cachesim.stream import ATOMIC, LOAD, STORE
+from cachesim.timing import fifo
+from cachesim.timing.access import MISSES, access, count_bypass, drop_request, fill, take_request
+from cachesim.timing.network import has_room, push
+from cachesim.timing.records import (
+    DEMANDED,
+    FAIL,
+    HIT,
+    MAX_WARPS,
+    PATH_BYPASS,
+    PATH_FIFO,
+    R_INTERCONNECT,
+    R_L1_BANDWIDTH,
+    R_L1_RESERVATION,
+)
+from cachesim.timing.tags import next_ready
+from cachesim.timing.warp import sector_back, store_done
+
+U64 = np.uint64
+
+
+@compiled
+def locate(route, address):  # type: ignore[no-untyped-def]
+    """(slice, line number inside it) of an address."""
+    numbers = route.numbers
+    where, number = slice_and_line(
+        U64(address),
+        U64(numbers[0]),
+        U64(numbers[1]),
+        U64(numbers[2]),
+        numbers[3],
+        numbers[4],
+        route.table,
+        numbers[5],
+        U64(numbers[6]),
+    )
+    return np.int64(where), np.int64(number)
+
+
+@compiled
+def send_up(state, request):  # type: ignore[no-untyped-def]
+    """Give a request of an SM to the interconnect, or to its GL1; False where there is no room."""
+    machine = state.pool.machine[0]
+    one = state.pool.requests[request]
+    if machine.has_gl1:
+        node = state.gl1.nodes[one.port]
+        level = state.gl1.level[0]
+        if node.delay_count + node.in_count >= level.queue_in:
+            return False
+        room = state.gl1.queues.shape[2] - 1
+        state.gl1.queues[one.port, 1, (node.delay_head + node.delay_count) & room] = request
+        node.delay_count += 1
+        one.ready = machine.now + 1 + level.latency
+        one.mark = machine.now
+        node.wake = min(node.wake, one.ready)
+        return True
+    return inject(state, request, machine.now + 1)
+
+
+@compiled
+def inject(state, request, time):  # type: ignore[no-untyped-def]
+    """Put a request into the request network; False where there is no room."""
+    machine = state.pool.machine[0]
+    one = state.pool.requests[request]
+    where, number = locate(state.l2_route, one.address)
+    if not has_room(machine, state.up, one.port, where):
+        return False
+    one.slice = where
+    one.number = number
+    one.mark = machine.now
+    payload = machine.store_bytes if one.write else 0
+    push(machine, state.up, one.port, where, request, payload, time)
+    if machine.output_queued:
+        node = state.l2.nodes[where]
+        node.wake = min(node.wake, time)
+    return True
+
+
+@compiled
+def _returned(state, request):  # type: ignore[no-untyped-def]
+    """Book a sector that reached its register, and forget its request."""
+    machine = state.pool.machine[0]
+    one = state.pool.requests[request]
+    took = machine.now - one.born
+    state.latency[one.source, 0] += took
+    state.latency[one.source, 1] += 1
+    sector_back(state, one.warp, one.load)
+    drop_request(state.pool, request)
+
+
+@compiled
+def _write_back(state, unit):  # type: ignore[no-untyped-def]
+    """Write one sector to the registers, and choose the next client: texture, bypassed or L1."""
+    machine = state.pool.machine[0]
+    pipe = state.pipes[unit]
+    if pipe.next_writeback >= 0:
+        _returned(state, pipe.next_writeback)
+        pipe.next_writeback = -1
+    for c in range(5):
+        client = (c + pipe.client) % 5
+        if client == 1:
+            if machine.has_fifo_l1 and pipe.result_count > 0:
+                pipe.next_writeback = fifo.next_result(state, unit)
+        elif client == 3:
+            if pipe.next_global >= 0:
+                pipe.next_writeback = pipe.next_global
+                pipe.next_global = -1
+        elif client == 4 and state.l1.nodes[unit].ready_first >= 0:
+            pipe.next_writeback = next_ready(state.l1, state.pool.requests, unit)
+        if pipe.next_writeback >= 0:
+            pipe.client = (client + 1) % 5
+            return
+
+
+@compiled
+def _respond(state, unit):  # type: ignore[no-untyped-def]
+    """Take one reply: an acknowledged store, bypassed data, or data for the L1."""
+    machine = state.pool.machine[0]
+    pipe = state.pipes[unit]
+    if pipe.response_count == 0:
+        return
+    room = state.responses.shape[1] - 1
+    request = state.responses[unit, pipe.response_head & room]
+    one = state.pool.requests[request]
+    if one.write:
+        if one.warp >= 0:
+            store_done(state, one.warp)
+        drop_request(state.pool, request)
+    elif one.path == PATH_BYPASS:
+        if pipe.next_global >= 0:
+            return
+        pipe.next_global = request
+    elif one.path == PATH_FIFO:
+        fifo.arrived(state, unit, request)
+    else:
+        node = state.l1.nodes[unit]
+        if node.fill_time > machine.now * 256:
+            return
+        node.fill_time = max(node.fill_time, machine.now * 256) + state.l1.level[0].fill_cost
+        fill(state.l1, state.pool, unit, request, machine.now)
+    pipe.response_head = (pipe.response_head + 1) & room
+    pipe.response_count -= 1
+
+
+@compiled
+def _drain_misses(state, unit):  # type: ignore[no-untyped-def]
+    """Send the oldest miss on."""
+    node = state.l1.nodes[unit]
+    if node.miss_count == 0:
+        return
+    room = state.l1.queues.shape[2] - 1
+    request = state.l1.queues[unit, MISSES, node.miss_head & room]
+    if send_up(state, request):
+        node.miss_head = (node.miss_head + 1) & room
+        node.miss_count -= 1
+        node.version += 1
+
+
+@compiled
+def _look_up(state, unit):  # type: ignore[no-untyped-def]
+    """Tag look-ups of the accesses whose delay is over, one per bank."""
+    machine = state.pool.machine[0]
+    pipe = state.pipes[unit]
+    node = state.l1.nodes[unit]
+    room = state.banks.shape[1] - 1
+    now = machine.now
+    for bank in range(machine.num_banks):
+        if pipe.bank_count[bank] == 0:
+            continue
+        request = state.banks[unit * machine.num_banks + bank, pipe.bank_head[bank] & room]
+        one = state.pool.requests[request]
+        if one.ready > now:
+            continue
+        if pipe.bank_failed[bank] == node.version:
+            state.l1.outcomes[1 if one.write else 0, FAIL] += 1
+            pipe.blocked = R_L1_RESERVATION
+            continue
+        outcome, sent = access(state.l1, state.pool, unit, request, now)
+        if outcome == FAIL:
+            pipe.bank_failed[bank] = node.version
+            pipe.blocked = R_L1_RESERVATION
+            continue
+        pipe.bank_failed[bank] = -1
+        pipe.bank_head[bank] = (pipe.bank_head[bank] + 1) & room
+        pipe.bank_count[bank] -= 1
+        pipe.in_banks -= 1
+        if one.operation == STORE:
+            node.version += 1
+            if not sent:
+                store_done(state, one.warp)
+                drop_request(state.pool, request)
+        elif outcome == HIT:
+            _returned(state, request)
+        else:
+            node.version += 1
+
+
+@compiled
+def _new_request(state, unit, address, at, sector):  # type: ignore[no-untyped-def]
+    """A request for one sector of the instruction the pipe works on."""
+    machine = state.pool.machine[0]
+    pipe = state.pipes[unit]
+    index = take_request(state.pool)
+    one = state.pool.requests[index]
+    instruction = state.work.instructions[pipe.code]
+    one.address = address
+    one.warp = pipe.warp
+    one.load = pipe.load
+    one.unit = unit
+    one.group = state.work.group[at]
+    one.operation = instruction.operation
+    one.write = 1 if instruction.operation == STORE else 0
+    one.kind = DEMANDED
+    one.path = pipe.path
+    one.born = machine.now
+    one.mark = machine.now
+    sm = unit // machine.units
+    one.port = sm // machine.sms_per_gl1 if machine.has_gl1 else sm
+    one.bytes = 0
+    if one.write:
+        where = state.work.written[at] + sector
+        one.bytes = state.work.granules[where & (len(state.work.granules) - 1)]
+        state.warps[pipe.warp].stores += 1
+    return index
+
+
+@compiled
+def _highest(mask):  # type: ignore[no-untyped-def]
+    sector = 7
+    while (mask >> sector) & 1 == 0:
+        sector -= 1
+    return sector
+
+
+@compiled
+def _issue_accesses(state, unit):  # type: ignore[no-untyped-def]
+    """Hand sectors of the instruction at hand to the L1's banks, or around it, from the highest
+    address down; a bank clash ends the cycle. Returns whether the instruction is done.
+    """
+    machine = state.pool.machine[0]
+    pipe = state.pipes[unit]
+    work = state.work
+    room = state.banks.shape[1] - 1
+    level = state.l1.level[0]
+    now = machine.now
+    moves = 1 if pipe.path != 0 else machine.num_banks
+    for _ in range(moves):
+        while pipe.mask == 0 and pipe.at > pipe.first:
+            pipe.at -= 1
+            pipe.mask = work.mask[pipe.at & machine.request_mask]
+            if pipe.path == 0:
+                state.l1.counters[work.group[pipe.at & machine.request_mask], REQUESTS] += 1
+        if pipe.mask == 0:
+            break
+        at = pipe.at & machine.request_mask
+        sector = _highest(pipe.mask)
+        address = (work.line[at] << level.line_shift) + (sector << level.sector_shift)
+        if pipe.path == PATH_BYPASS:
+            where, _number = locate(state.l2_route, address)
+            source = unit // machine.units
+            if not machine.has_gl1 and not has_room(machine, state.up, source, where):
+                pipe.blocked = R_INTERCONNECT
+                return False
+            index = _new_request(state, unit, address, at, sector)
+            if not send_up(state, index):
+                if state.pool.requests[index].write:
+                    state.warps[pipe.warp].stores -= 1
+                drop_request(state.pool, index)
+                pipe.blocked = R_INTERCONNECT
+                return False
+            count_bypass(state.l1, work.group[at], state.pool.requests[index].operation != LOAD)
+        elif pipe.path == PATH_FIFO:
+            if not fifo.accepts(state, unit):
+                pipe.blocked = R_L1_RESERVATION
+                return False
+            index = _new_request(state, unit, address, at, sector)
+            fifo.access(state, unit, index)
+        else:
+            bank = (address >> machine.bank_shift) & (machine.num_banks - 1)
+            if pipe.bank_count[bank] >= machine.l1_latency or pipe.bank_entered[bank] == now:
+                machine.bank_conflicts += 1
+                if pipe.blocked == 0:
+                    pipe.blocked = R_L1_BANDWIDTH
+                return False
+            index = _new_request(state, unit, address, at, sector)
+            state.pool.requests[index].ready = now + machine.l1_latency
+            place = (pipe.bank_head[bank] + pipe.bank_count[bank]) & room
+            state.banks[unit * machine.num_banks + bank, place] = index
+            pipe.bank_count[bank] += 1
+            pipe.bank_entered[bank] = now
+            pipe.in_banks += 1
+        pipe.mask &= ~(1 << sector)
+        pipe.left -= 1
+    if pipe.left > 0:
+        if pipe.blocked == 0:
+            pipe.blocked = R_L1_BANDWIDTH
+        return False
+    return True
+
+
+@compiled
+def _law_cycles(state, row, instruction):  # type: ignore[no-untyped-def]
+    """Cycles that tags, data port and filters need for one instruction (facts sheet 1.6, 2.5)."""
+    machine = state.pool.machine[0]
+    cycles = 1
+    if machine.lines_per_cycle > 0:
+        cycles = max(cycles, -(-row.count // machine.lines_per_cycle))
+    if machine.bytes_per_cycle > 0:
+        moved = row.lanes * instruction.access_bytes
+        cycles = max(cycles, -(-moved // machine.bytes_per_cycle))
+    if machine.quads_per_cycle > 0 and instruction.quad_cost > 0:
+        quads = -(-row.lanes // 4) * instruction.quad_cost
+        cycles = max(cycles, -(-quads // machine.quads_per_cycle))
+    return cycles
+
+
+@compiled
+def _take_instruction(state, index, unit):  # type: ignore[no-untyped-def]
+    """Take the memory instruction that issued first among the schedulers' queue heads."""
+    machine = state.pool.machine[0]
+    sm = state.sms[index]
+    pipe = state.pipes[unit]
+    now = machine.now
+    if pipe.free_at > now:
+        if pipe.blocked == 0:
+            pipe.blocked = R_L1_BANDWIDTH
+        return
+    best, oldest = -1, now + 1
+    for s in range(machine.num_schedulers):
+        if sm.queue_count[s] == 0:
+            continue
+        at = sm.queue_head[s]
+        if (
+            machine.units > 1
+            and (sm.queue_warp[s, at] // 2) % machine.units != unit % machine.units
+        ):
+            continue
+        time = sm.queue_time[s, at]
+        if time < oldest:
+            best, oldest = s, time
+    if best < 0:
+        return
+    at = sm.queue_head[best]
+    slot = sm.queue_warp[best, at]
+    sm.queue_head[best] = at + 1 if at + 1 < machine.memory_queue else 0
+    sm.queue_count[best] -= 1
+    pipe.warp = index * MAX_WARPS + slot
+    # The queue keeps the row beside the slot: the warp itself has moved on.
+    row = state.work.rows[sm.queue_row[best, at] & machine.row_mask]
+    instruction = state.work.instructions[row.code]
+    pipe.code = row.code
+    pipe.first = row.first
+    pipe.at = row.first + row.count
+    pipe.mask = 0
+    pipe.left = row.sectors
+    pipe.load = sm.queue_load[best, at]
+    pipe.path = instruction.path
+    if instruction.operation == ATOMIC:
+        pipe.path = PATH_BYPASS
+    pipe.free_at = now + _law_cycles(state, row, instruction)
+    state.moved[0] += row.sectors << state.l1.level[0].sector_shift
+    if row.sectors == 0 and instruction.operation != STORE:
+        # A fully masked access asks for nothing; `issue` left one sector pending for it.
+        sector_back(state, pipe.warp, pipe.load)
+
+
+@compiled
+def step_pipe(state, index, unit):  # type: ignore[no-untyped-def]
+    """One cycle of the pipe, from its end to its start."""
+    machine = state.pool.machine[0]
+    pipe = state.pipes[unit]
+    pipe.blocked = 0
+    _write_back(state, unit)
+    _respond(state, unit)
+    if machine.has_fifo_l1:
+        if pipe.request_count > 0 and send_up(state, fifo.oldest_request(state, unit)):
+            fifo.request_sent(state, unit)
+        fifo.step(state, unit)
+    _drain_misses(state, unit)
+    if pipe.in_banks > 0:
+        _look_up(state, unit)
+    if pipe.warp >= 0 and _issue_accesses(state, unit):
+        pipe.warp = -1
+    if pipe.warp < 0:
+        _take_instruction(state, index, unit)
+
+
+__all__ = ["HIT", "inject", "locate", "send_up", "step_pipe"]

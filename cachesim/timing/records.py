@@ -1,0 +1,357 @@
+"""The machine's state as flat arrays of records: what the compiled loops read and write.
+
+Records keep what one step touches together, and a loop needs one pointer per table. Fixed sizes in
+them bound the machine: `check_bounds` in `cachesim.timing.machine` refuses a larger one.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+MAX_WARPS = 64
+MAX_SCHEDULERS = 8
+MAX_BANKS = 64
+MAX_LOADS = 64
+MAX_DRAM_BANKS = 64
+MAX_MEMORY_QUEUE = 64
+MAX_SUBSLICES = 8
+#: Slots of the wheel that wakes warps: a power of two above every unit's latency.
+WHEEL = 512
+
+NEVER = 1 << 62
+
+# What an instruction needs: the index of a ready mask. `MEMORY` is any access, WAIT issues nothing.
+INT, FP32, SFU, CONTROL, MEMORY, WAIT = range(6)
+KINDS = ("int", "fp32", "sfu", "control", "memory", "wait")
+
+# Fetch paths of a request.
+PATH_L1, PATH_BYPASS, PATH_FIFO = range(3)
+
+# What a request is: asked by a warp, a write-back, a fetch for a store.
+DEMANDED, WRITEBACK, WRITE_FILL = range(3)
+
+# Levels: the index of a request's links, and of the tables of levels.
+L1, GL1, L2, LLC = range(4)
+
+# Outcomes of an access, GPGPU-Sim's (facts sheet 4), and the extra count MSHR_HIT.
+HIT, HIT_RESERVED, MISS, SECTOR_MISS, FAIL, MSHR_HIT = range(6)
+OUTCOMES = ("HIT", "HIT_RESERVED", "MISS", "SECTOR_MISS", "RESERVATION_FAIL", "MSHR_HIT")
+
+# Reasons for a cycle of an SM, in the order of `results.REASONS`; MEMORY_WAIT is shared out over
+# interconnect, l2, dram and latency at the end.
+R_ISSUE, R_ARITHMETIC, R_L1_BANDWIDTH, R_L1_RESERVATION, R_INTERCONNECT, R_IDLE, R_MEMORY = range(7)
+NUM_REASONS = 7
+
+# Stages between an L1 and its reply, whose times are summed.
+S_REQUEST, S_L2, S_BELOW, S_REPLY = range(4)
+
+REQUEST = np.dtype(
+    [
+        ("address", "i8"),  # of its sector
+        ("ready", "i8"),  # core cycle from which the queue it lies in may pass it on
+        ("born", "i8"),  # when it entered the load/store unit's hands
+        ("mark", "i8"),  # when it entered the present stage
+        ("number", "i8"),  # line number inside its L2 slice
+        ("next", "i4", (4,)),  # links of MSHR lists, one per level; [3] also of DRAM's bank lists
+        ("parent", "i4"),  # the request it is a part of, or -1
+        ("pending", "i4"),  # parts that have not returned
+        ("warp", "i4"),  # sm * MAX_WARPS + slot, or -1
+        ("load", "i4"),  # which of the warp's loads
+        ("unit", "i4"),  # L1 unit
+        ("port", "i4"),  # of the interconnect, on the SMs' side
+        ("slice", "i4"),  # of the L2
+        ("group", "i4"),  # of counters
+        ("lower", "i4"),  # slice of the LLC, or memory channel
+        ("row", "i4"),
+        ("bytes", "u4"),  # granules a store covers
+        ("bank", "i2"),
+        ("operation", "u1"),  # `stream.LOAD` ...
+        ("path", "u1"),
+        ("kind", "u1"),
+        ("source", "u1"),  # the level its data came from: 0 L1, 1 GL1, 2 L2, 3 LLC, 4 DRAM
+        ("write", "u1"),
+        ("sectors", "u1"),  # L2 sectors of a texture line; 1 otherwise
+    ],
+    align=True,
+)
+
+LINE = np.dtype(
+    [
+        ("key", "i8"),  # address >> line shift, -1 = never used
+        ("chain", "i4"),  # next line of its hash bucket
+        ("newer", "i4"),  # neighbours in its set's order of use
+        ("older", "i4"),
+        ("set", "i4"),
+        ("valid", "u1"),  # sectors that can be read
+        ("partial", "u1"),  # sectors some bytes of which were written
+        ("modified", "u1"),
+        ("reserved", "u1"),  # sectors on their way
+    ],
+    align=True,
+)
+
+SET = np.dtype([("newest", "i4"), ("oldest", "i4"), ("reserved_lines", "i4")], align=True)
+
+MSHR = np.dtype(
+    [
+        ("key", "i8"),  # sector number
+        ("chain", "i4"),
+        ("first", "i4"),  # requests, oldest first
+        ("last", "i4"),
+        ("count", "i4"),
+        ("ready_next", "i4"),  # next entry whose data is there; also the list of free ones
+    ],
+    align=True,
+)
+
+#: One instance of a level: an L1 unit, a GL1, a slice.
+NODE = np.dtype(
+    [
+        ("wake", "i8"),
+        ("port_time", "i8"),  # in 1/256 core cycles: when the data port is free
+        ("fill_time", "i8"),
+        ("version", "i8"),  # counts what may turn a reservation fail into success
+        ("failed", "i8"),  # version at which the head of the queue failed, or -1
+        ("dirty_lines", "i8"),
+        ("mshr_free", "i4"),
+        ("mshr_used", "i4"),
+        ("ready_first", "i4"),
+        ("ready_last", "i4"),
+        ("in_head", "i4"),
+        ("in_count", "i4"),
+        ("delay_head", "i4"),
+        ("delay_count", "i4"),
+        ("miss_head", "i4"),
+        ("miss_count", "i4"),
+        ("down_head", "i4"),
+        ("down_count", "i4"),
+        ("fill_head", "i4"),
+        ("fill_count", "i4"),
+        ("out_head", "i4"),
+        ("out_count", "i4"),
+    ],
+    align=True,
+)
+
+#: The rules and sizes of one level.
+LEVEL = np.dtype(
+    [
+        (name, "i8")
+        for name in (
+            "line_shift", "sector_shift", "sector_mask", "num_sets", "ways", "touch_on_hit",
+            "on_miss_allocation", "on_hit", "on_store_miss", "all_bytes", "num_mshrs", "merge",
+            "miss_queue", "bucket_mask", "mshr_mask", "port_cost", "fill_cost", "width",
+            "latency", "texture_latency", "queue_in", "queue_down", "queue_fill", "queue_out",
+            "reserve_in", "dirty_limit", "sectors_per_line", "is_read_only", "delay_capacity",
+            "miss_capacity", "index", "set_kind", "num_instances",
+        )
+    ]
+)  # fmt: skip
+
+#: What LDST and issue logic of one SM need.
+SM = np.dtype(
+    [
+        ("wake", "i8"),
+        ("last_step", "i8"),
+        ("last_reason", "i8"),
+        ("num_timed", "i8"),
+        ("num_resident", "i8"),
+        ("num_blocked", "i8"),
+        ("resident_since", "i8"),
+        ("ready", "u8", (5,)),
+        ("last_issued", "i4", (MAX_SCHEDULERS,)),
+        ("parked", "i4", (MAX_SCHEDULERS,)),
+        ("parked_kind", "i4", (MAX_SCHEDULERS,)),
+        ("unit_free", "i8", (MAX_SCHEDULERS, 4)),
+        ("queue_head", "i4", (MAX_SCHEDULERS,)),
+        ("queue_count", "i4", (MAX_SCHEDULERS,)),
+        ("queue_warp", "i4", (MAX_SCHEDULERS, MAX_MEMORY_QUEUE)),
+        ("queue_time", "i8", (MAX_SCHEDULERS, MAX_MEMORY_QUEUE)),
+        ("queue_row", "i8", (MAX_SCHEDULERS, MAX_MEMORY_QUEUE)),
+        ("queue_load", "i4", (MAX_SCHEDULERS, MAX_MEMORY_QUEUE)),
+        ("eject_head", "i4"),
+        ("eject_count", "i4"),
+        ("free_places", "i4"),
+        ("cta_wait", "i8"),
+        ("wheel", "u8", (WHEEL,)),
+    ],
+    align=True,
+)
+
+#: The load/store and texture pipe in front of one L1 unit.
+PIPE = np.dtype(
+    [
+        ("warp", "i4"),  # whose instruction it works on, or -1
+        ("load", "i4"),
+        ("at", "i8"),  # request it works on, downwards
+        ("first", "i8"),
+        ("mask", "i8"),  # sectors of that request still to do
+        ("left", "i8"),  # sectors of the instruction still to do
+        ("code", "i4"),  # instruction
+        ("path", "i4"),
+        ("free_at", "i8"),  # when the tag, data and filter laws allow the next instruction
+        ("next_writeback", "i4"),
+        ("next_global", "i4"),
+        ("client", "i4"),
+        ("response_head", "i4"),
+        ("response_count", "i4"),
+        ("bank_head", "i4", (MAX_BANKS,)),
+        ("bank_count", "i4", (MAX_BANKS,)),
+        ("bank_entered", "i8", (MAX_BANKS,)),
+        ("bank_failed", "i8", (MAX_BANKS,)),
+        ("in_banks", "i8"),
+        ("blocked", "i4"),  # 0, or why nothing left the pipe this cycle
+        ("rob_head", "i4"),  # the texture FIFOs
+        ("rob_count", "i4"),
+        ("fragment_count", "i4"),
+        ("request_head", "i4"),
+        ("request_count", "i4"),
+        ("result_count", "i4"),
+        ("result_head", "i4"),
+        ("fragment_head", "i4"),
+    ],
+    align=True,
+)
+
+WARP = np.dtype(
+    [
+        ("row", "i8"),
+        ("rows_left", "i8"),
+        ("operation", "i4"),  # micro-operation
+        ("last_operation", "i4"),
+        ("left", "i4"),  # of the micro-operation's count
+        ("chain", "i4"),
+        ("parity", "i4"),
+        ("in_trailer", "i4"),
+        ("waits_for", "i4"),  # loads up to this sequence number must be back; -1 = not waiting
+        ("next_load", "i4"),
+        ("oldest_load", "i4"),
+        ("stores", "i4"),
+        ("cta", "i4"),  # place
+        ("alive", "i4"),
+        ("age", "i8"),
+        ("int_ready", "i8"),
+        ("chains_ready", "i8", (3,)),
+        ("pending", "i4", (MAX_LOADS,)),
+    ],
+    align=True,
+)
+
+#: A static access instruction, and the micro-operations before it.
+INSTRUCTION = np.dtype(
+    [
+        ("first", "i4"),
+        ("last", "i4"),
+        ("operation", "i4"),
+        ("path", "i4"),
+        ("quad_cost", "i4"),  # cycles of one quad in a texture filter, 0 = no filter
+        ("access_bytes", "i4"),
+        ("num_outstanding", "i4"),
+    ],
+    align=True,
+)
+OPERATION = np.dtype([("kind", "i4"), ("count", "i4")])
+
+#: A row that waits in an SM: an access instruction of one warp.
+ROW = np.dtype(
+    [("first", "i8"), ("count", "i4"), ("lanes", "i4"), ("code", "i4"), ("sectors", "i4")],
+    align=True,
+)
+
+PORT = np.dtype(
+    [
+        ("in_head", "i4"),
+        ("in_count", "i4"),
+        ("in_busy", "i8"),
+        ("candidate", "i4"),  # next input whose head wants the same output
+    ],
+    align=True,
+)
+OUTLET = np.dtype(
+    [
+        ("head", "i4"),
+        ("count", "i4"),
+        ("busy", "i8"),
+        ("turn", "i4"),
+        ("first", "i4"),  # inputs whose head wants this output
+        ("stamp", "i8"),  # cycle for which `first` holds
+    ],
+    align=True,
+)
+
+CHANNEL = np.dtype(
+    [
+        ("wake", "i8"),  # tick
+        ("ccd", "i8"),
+        ("rrd", "i8"),
+        ("rtw", "i8"),
+        ("wtr", "i8"),
+        ("is_writing", "i4"),
+        ("priority", "i4"),
+        ("pending", "i4"),
+        ("num_serving", "i4"),
+        ("last_borrower", "i4"),
+        ("shared_credit", "i4"),
+        ("private_credit", "i4", (MAX_SUBSLICES,)),
+        ("latency_head", "i4"),
+        ("latency_count", "i4"),
+        ("entry_head", "i4"),
+        ("entry_count", "i4"),
+        ("data_head", "i4"),
+        ("data_count", "i4"),
+        ("return_head", "i4"),
+        ("return_count", "i4"),
+    ],
+    align=True,
+)
+BANK = np.dtype(
+    [
+        ("serving", "i4"),
+        ("left", "i4"),  # bursts of `serving`
+        ("open_row", "i4"),  # -1 = none
+        ("first", "i4"),
+        ("last", "i4"),
+        ("rcd", "i8"),
+        ("rcdwr", "i8"),
+        ("ras", "i8"),
+        ("rp", "i8"),
+        ("rc", "i8"),
+        ("wtp", "i8"),
+        ("rtp", "i8"),
+    ],
+    align=True,
+)
+BANK_GROUP = np.dtype([("ccdl", "i8"), ("rtpl", "i8")])
+
+#: Scalars of the whole machine: sizes and rules first, then what changes.
+MACHINE = np.dtype(
+    [
+        (name, "i8")
+        for name in (
+            # rules
+            "num_sms", "units", "num_schedulers", "is_gto", "issue_per_warp", "different_units",
+            "int_on_fp32", "result_cycles", "memory_cycles", "memory_queue", "collector_units",
+            "quads_per_cycle", "lines_per_cycle", "bytes_per_cycle", "num_banks", "bank_shift",
+            "l1_latency", "bypass", "has_fifo_l1", "fragment_fifo", "request_fifo", "rob",
+            "result_fifo", "max_slots", "launch_cycles", "cta_launch_cycles", "ejection",
+            "response", "num_ports", "num_slices", "num_gl1", "num_llc", "num_channels",
+            "sms_per_gl1", "subslices", "output_queued", "match_again", "request_latency",
+            "reply_latency", "flit_bytes", "header_bytes", "input_packets", "output_packets",
+            "l2_sector_shift", "core_hz", "dram_hz", "fixed_latency", "dram_queue",
+            "return_queue", "dual_bus", "fr_fcfs", "num_dram_banks", "group_mask", "bursts",
+            "ccd", "rrd", "rcd", "rcdwr", "ras", "rp", "rc", "cl", "wl", "rtw", "wtr", "wtp",
+            "rtp", "ccdl", "rtpl", "shared_credits", "llc_sector_shift", "last_level",
+            "unloaded_request", "unloaded_reply", "unloaded_dram", "channel_shift",
+            "num_pool", "warps_per_cta", "num_places", "sector_shift",
+            # state
+            "now", "tick", "tick_remainder", "free_top", "queued", "taken", "complete",
+            "last_sm", "live_ctas", "warps_seen", "warps_total", "age", "row_mask",
+            "request_mask", "in_flight", "packets_up", "packets_down", "first_cta",
+            "place_from", "stuck_since", "progress", "num_rows",
+            "num_lane_fetches", "bank_conflicts", "instruction_threads", "has_gl1", "has_llc",
+            "error", "ctas_done", "trailer_first", "trailer_last", "icnt_busy", "queued_dram",
+            "dram_reads", "dram_writes", "row_hits", "activates", "precharges",
+            "store_bytes", "line_parts",
+        )
+    ]
+)  # fmt: skip

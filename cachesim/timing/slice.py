@@ -1,0 +1,236 @@
+"""A cache below the L1 (a GL1, an L2 slice, a slice of the last-level cache), one cycle at a time.
+
+arrival ──► delay ──► queue ──► look-up ──► miss queue ──► down
+reply ◄── ready MSHRs ◄── fill ◄── from below
+"""
+
+from __future__ import annotations
+
+from cachesim.compiled import compiled
+from cachesim.counts import HIT_BACK
+from cachesim.stream import ATOMIC, LOAD, STORE
+from cachesim.timing.access import (
+    DELAY,
+    DOWN,
+    FILLS,
+    IN,
+    MISSES,
+    OUT,
+    access,
+    count_bypass,
+    drop_request,
+    fill,
+    note,
+    push_miss,
+)
+from cachesim.timing.records import (
+    DEMANDED,
+    FAIL,
+    HIT,
+    HIT_RESERVED,
+    L2,
+    NEVER,
+    S_BELOW,
+    S_L2,
+    WRITE_FILL,
+    WRITEBACK,
+)
+from cachesim.timing.tags import next_ready
+
+
+@compiled
+def _push(tags, node, which, head, count, request):  # type: ignore[no-untyped-def]
+    room = tags.queues.shape[2] - 1
+    tags.queues[node, which, (head + count) & room] = request
+
+
+@compiled
+def _front(tags, node, which, head):  # type: ignore[no-untyped-def]
+    return tags.queues[node, which, head & (tags.queues.shape[2] - 1)]
+
+
+@compiled
+def _answer(tags, pool, node, request):  # type: ignore[no-untyped-def]
+    """Queue a reply towards the SMs."""
+    home = tags.nodes[node]
+    _push(tags, node, OUT, home.out_head, home.out_count, request)
+    home.out_count += 1
+
+
+@compiled
+def _take_ready(tags, pool, node, now):  # type: ignore[no-untyped-def]
+    """Answer one request whose data is there."""
+    home = tags.nodes[node]
+    level = tags.level[0]
+    if home.ready_first < 0 or home.out_count >= level.queue_out:
+        return False
+    request = next_ready(tags, pool.requests, node)
+    if pool.requests[request].kind == WRITE_FILL:
+        drop_request(pool, request)
+    else:
+        _answer(tags, pool, node, request)
+    return True
+
+
+@compiled
+def _take_fill(tags, pool, node, now):  # type: ignore[no-untyped-def]
+    """Put one sector that came from below into the array, or pass an acknowledgement on."""
+    home = tags.nodes[node]
+    level = tags.level[0]
+    if home.fill_count == 0:
+        return False
+    request = _front(tags, node, FILLS, home.fill_head)
+    one = pool.requests[request]
+    passes = one.write or (level.is_read_only and one.path == 1)
+    if passes:
+        if home.out_count >= level.queue_out:
+            return False
+        _answer(tags, pool, node, request)
+    else:
+        if home.fill_time > now * 256:
+            return False
+        if level.index == L2 and one.kind == DEMANDED:
+            note(pool, S_BELOW, request, now)
+        home.fill_time = max(home.fill_time, (now - 1) * 256) + level.fill_cost
+        fill(tags, pool, node, request, now)
+    home.fill_head += 1
+    home.fill_count -= 1
+    return True
+
+
+@compiled
+def _drain_miss(tags, node):  # type: ignore[no-untyped-def]
+    home = tags.nodes[node]
+    if home.miss_count == 0 or home.down_count >= tags.level[0].queue_down:
+        return False
+    request = _front(tags, node, MISSES, home.miss_head)
+    _push(tags, node, DOWN, home.down_head, home.down_count, request)
+    home.down_count += 1
+    home.miss_head += 1
+    home.miss_count -= 1
+    home.version += 1
+    return True
+
+
+@compiled
+def _look_up(tags, pool, node, now):  # type: ignore[no-untyped-def]
+    """Look up the oldest request, if the data port is free and its outcome has somewhere to go."""
+    home = tags.nodes[node]
+    level = tags.level[0]
+    if (
+        home.in_count == 0
+        or home.down_count >= level.queue_down
+        or home.out_count >= level.queue_out
+        or home.port_time > now * 256
+    ):
+        return False
+    request = _front(tags, node, IN, home.in_head)
+    one = pool.requests[request]
+    if home.failed == home.version:
+        tags.outcomes[1 if one.write else 0, FAIL] += 1
+        return False
+    # A read-only level and what may not be looked up: stores, atomics and bypassing loads pass.
+    goes_around = level.is_read_only and (one.operation != LOAD or one.path == 1)
+    if goes_around or (one.operation == ATOMIC and level.on_hit != HIT_BACK):
+        if home.miss_count >= level.miss_queue:
+            return False
+        count_bypass(tags, one.group, one.operation != LOAD)
+        push_miss(tags, node, request)
+    else:
+        outcome, sent = access(tags, pool, node, request, now)
+        if outcome == FAIL:
+            home.failed = home.version
+            return False
+        if outcome == HIT or one.operation == STORE:
+            home.port_time = max(home.port_time, (now - 1) * 256 + 1) + level.port_cost
+        if one.operation == STORE:
+            if not sent:
+                if one.kind == WRITEBACK:
+                    drop_request(pool, request)
+                else:
+                    one.source = level.index
+                    _answer(tags, pool, node, request)
+        elif outcome == HIT:
+            one.source = level.index
+            _answer(tags, pool, node, request)
+        if outcome != HIT:
+            home.version += 1
+    home.in_head += 1
+    home.in_count -= 1
+    home.failed = -1
+    if level.index == L2 and one.kind == DEMANDED:
+        note(pool, S_L2, request, now)
+    return True
+
+
+@compiled
+def _leave_delay(tags, pool, node, now):  # type: ignore[no-untyped-def]
+    home = tags.nodes[node]
+    if home.delay_count == 0 or home.in_count >= tags.level[0].queue_in:
+        return False
+    request = _front(tags, node, DELAY, home.delay_head)
+    if pool.requests[request].ready > now:
+        return False
+    _push(tags, node, IN, home.in_head, home.in_count, request)
+    home.in_count += 1
+    home.delay_head += 1
+    home.delay_count -= 1
+    return True
+
+
+@compiled
+def arrive(tags, pool, node, request, ready):  # type: ignore[no-untyped-def]
+    """A request reaches the level; it may be looked up after cycle `ready`."""
+    home = tags.nodes[node]
+    pool.requests[request].ready = ready
+    _push(tags, node, DELAY, home.delay_head, home.delay_count, request)
+    home.delay_count += 1
+
+
+@compiled
+def come_back(tags, pool, node, request):  # type: ignore[no-untyped-def]
+    """Data or an acknowledgement reaches the level from below."""
+    home = tags.nodes[node]
+    _push(tags, node, FILLS, home.fill_head, home.fill_count, request)
+    home.fill_count += 1
+
+
+@compiled
+def step_cache(tags, pool, node, now):  # type: ignore[no-untyped-def]
+    """One cycle of one instance, its end first; sets the cycle in which it wants to be stepped
+    again, arrivals apart.
+    """
+    width = tags.level[0].width
+    for _ in range(width):
+        if not _take_ready(tags, pool, node, now):
+            break
+    for _ in range(width):
+        if not _take_fill(tags, pool, node, now):
+            break
+    for _ in range(width):
+        if not _drain_miss(tags, node):
+            break
+    for _ in range(width):
+        if not _look_up(tags, pool, node, now):
+            break
+    for _ in range(width):
+        if not _leave_delay(tags, pool, node, now):
+            break
+    home = tags.nodes[node]
+    if (
+        home.in_count > 0
+        or home.out_count > 0
+        or home.fill_count > 0
+        or home.miss_count > 0
+        or home.down_count > 0
+        or home.ready_first >= 0
+    ):
+        home.wake = now + 1
+    elif home.delay_count > 0:
+        request = _front(tags, node, DELAY, home.delay_head)
+        home.wake = max(now + 1, pool.requests[request].ready)
+    else:
+        home.wake = NEVER
+
+
+__all__ = ["DEMANDED", "HIT_RESERVED", "arrive", "come_back", "step_cache"]

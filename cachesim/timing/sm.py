@@ -1,0 +1,279 @@
+"""One SM: its schedulers, execution units, and the pipes of its L1 units."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from cachesim.compiled import compiled
+from cachesim.stream import STORE
+from cachesim.timing.pipe import step_pipe
+from cachesim.timing.records import (
+    FP32,
+    INT,
+    MAX_LOADS,
+    MAX_WARPS,
+    MEMORY,
+    NEVER,
+    R_ARITHMETIC,
+    R_IDLE,
+    R_ISSUE,
+    R_L1_BANDWIDTH,
+    R_MEMORY,
+    WHEEL,
+)
+from cachesim.timing.warp import advance, schedule, start_warp, wake_timed
+
+U64 = np.uint64
+#: An instruction may issue this many cycles before its unit is free: it is collected meanwhile.
+_AHEAD = 3
+
+
+@compiled
+def _pick(state, index, scheduler, candidates):  # type: ignore[no-untyped-def]
+    """The warp slot a scheduler chooses among the candidates (a mask)."""
+    machine = state.pool.machine[0]
+    sm = state.sms[index]
+    last = sm.last_issued[scheduler]
+    step = machine.num_schedulers
+    if machine.is_gto:
+        if last >= 0 and (candidates >> U64(last)) & U64(1):
+            return last
+        best, age = -1, NEVER
+        for slot in range(scheduler, MAX_WARPS, step):
+            if (candidates >> U64(slot)) & U64(1):
+                one = state.warps[index * MAX_WARPS + slot].age
+                if one < age:
+                    best, age = slot, one
+        return best
+    first = last + step if last >= 0 else scheduler
+    for slot in range(first, MAX_WARPS, step):
+        if (candidates >> U64(slot)) & U64(1):
+            return slot
+    for slot in range(scheduler, first, step):
+        if (candidates >> U64(slot)) & U64(1):
+            return slot
+    return -1
+
+
+@compiled
+def _start_arithmetic(state, index, scheduler, warp, kind, now):  # type: ignore[no-untyped-def]
+    """Send an instruction to its unit, and note when its result is there."""
+    machine = state.pool.machine[0]
+    sm = state.sms[index]
+    unit = FP32 if kind == INT and machine.int_on_fp32 else kind
+    start = max(now + _AHEAD, sm.unit_free[scheduler, unit])
+    sm.unit_free[scheduler, unit] = start + state.latencies[kind, 1]
+    done = start + state.latencies[kind, 0] + machine.result_cycles - _AHEAD
+    warp.chains_ready[warp.chain] = done
+    if kind == INT:
+        warp.int_ready = done
+
+
+@compiled
+def _start_memory(state, index, scheduler, slot, warp, now):  # type: ignore[no-untyped-def]
+    """Queue an access for the load/store unit."""
+    machine = state.pool.machine[0]
+    sm = state.sms[index]
+    work = state.work
+    row = work.rows[warp.row & machine.row_mask]
+    at = sm.queue_head[scheduler] + sm.queue_count[scheduler]
+    if at >= machine.memory_queue:
+        at -= machine.memory_queue
+    sm.queue_warp[scheduler, at] = slot
+    sm.queue_time[scheduler, at] = now + machine.memory_cycles - 1
+    sm.queue_row[scheduler, at] = warp.row
+    sm.queue_count[scheduler] += 1
+    if work.instructions[row.code].operation != STORE:
+        sm.queue_load[scheduler, at] = warp.next_load
+        warp.pending[warp.next_load & (MAX_LOADS - 1)] = max(1, row.sectors)
+        warp.next_load += 1
+
+
+@compiled
+def _issue(state, index, scheduler):  # type: ignore[no-untyped-def]
+    """Issue up to `issue_per_warp` instructions of one warp. Returns how many."""
+    machine = state.pool.machine[0]
+    sm = state.sms[index]
+    now = machine.now
+    mine = state.scheduler_masks[scheduler]
+    candidates = U64(0)
+    waiting = sm.queue_count[scheduler]
+    if waiting < machine.memory_queue:
+        candidates = sm.ready[MEMORY] & mine
+    # Memory instructions that wait hold the operand collectors.
+    if machine.collector_units == 0 or waiting <= machine.collector_units:
+        for kind in range(4):
+            unit = FP32 if kind == INT and machine.int_on_fp32 else kind
+            if sm.ready[kind] & mine and sm.unit_free[scheduler, unit] <= now + _AHEAD:
+                candidates |= sm.ready[kind] & mine
+    if candidates == 0:
+        return 0
+    slot = _pick(state, index, scheduler, candidates)
+    bit = U64(1) << U64(slot)
+    warp = state.warps[index * MAX_WARPS + slot]
+    issued = 0
+    previous = -1
+    while True:
+        kind = 0
+        while (sm.ready[kind] & bit) == 0:
+            kind += 1
+        unit = FP32 if kind == INT and machine.int_on_fp32 else kind
+        if issued > 0:
+            if machine.different_units and unit == previous:
+                break
+            if kind == MEMORY:
+                if sm.queue_count[scheduler] >= machine.memory_queue:
+                    break
+            elif sm.unit_free[scheduler, unit] > now + _AHEAD:
+                break
+        sm.ready[kind] &= ~bit
+        if kind == MEMORY:
+            _start_memory(state, index, scheduler, slot, warp, now)
+        else:
+            _start_arithmetic(state, index, scheduler, warp, kind, now)
+        state.issued[kind] += 1
+        issued += 1
+        previous = unit
+        # Instructions are fetched in pairs; only the two of a pair can issue together.
+        again = issued < machine.issue_per_warp and warp.parity == 0
+        warp.parity ^= 1
+        advance(state, index, slot, now, again)
+        if not again or not warp.alive:
+            break
+        ready = False
+        for kind in range(5):
+            if sm.ready[kind] & bit:
+                ready = True
+        if not ready:
+            break
+    sm.last_issued[scheduler] = slot
+    return issued
+
+
+@compiled
+def _next_event(state, index):  # type: ignore[no-untyped-def]
+    """The next cycle in which the SM has something to do, replies from outside apart."""
+    machine = state.pool.machine[0]
+    sm = state.sms[index]
+    now = machine.now
+    for kind in range(5):
+        if sm.ready[kind] != 0:
+            return now + 1
+    soonest = NEVER
+    for s in range(machine.num_schedulers):
+        if sm.queue_count[s] > 0:
+            return now + 1
+    for unit in range(index * machine.units, (index + 1) * machine.units):
+        pipe = state.pipes[unit]
+        node = state.l1.nodes[unit]
+        if (
+            pipe.warp >= 0
+            or pipe.next_writeback >= 0
+            or pipe.next_global >= 0
+            or pipe.response_count > 0
+            or node.miss_count > 0
+            or node.ready_first >= 0
+            or pipe.request_count > 0
+            or pipe.result_count > 0
+        ):
+            return now + 1
+        if pipe.fragment_count > 0:
+            room = state.fifo.shape[2] - 1
+            if state.pool.requests[state.fifo[unit, 0, pipe.fragment_head & room]].pending == 0:
+                return now + 1
+        if pipe.in_banks > 0:
+            room = state.banks.shape[1] - 1
+            for bank in range(machine.num_banks):
+                if pipe.bank_count[bank] > 0:
+                    at = state.banks[unit * machine.num_banks + bank, pipe.bank_head[bank] & room]
+                    soonest = min(soonest, max(now + 1, state.pool.requests[at].ready))
+    if sm.num_timed > 0:
+        for ahead in range(1, WHEEL):
+            if now + ahead >= soonest:
+                break
+            if sm.wheel[(now + ahead) & (WHEEL - 1)] != 0:
+                soonest = now + ahead
+                break
+    return soonest
+
+
+@compiled
+def step_sm(state, index):  # type: ignore[no-untyped-def]
+    """One cycle of an SM; sets the cycle in which it wants to be stepped again."""
+    machine = state.pool.machine[0]
+    sm = state.sms[index]
+    now = machine.now
+    # The cycles it slept through went where its last one did.
+    state.reasons[sm.last_reason] += now - sm.last_step - 1
+    sm.last_step = now
+    blocked = 0
+    for unit in range(index * machine.units, (index + 1) * machine.units):
+        step_pipe(state, index, unit)
+        blocked = max(blocked, state.pipes[unit].blocked)
+    if sm.num_timed > 0:
+        wake_timed(state, index)
+    issued = 0
+    if sm.num_resident > 0:
+        for s in range(machine.num_schedulers):
+            scheduler = (s + now) % machine.num_schedulers
+            issued += _issue(state, index, scheduler)
+    if issued > 0:
+        reason = R_ISSUE
+    elif sm.num_resident == 0:
+        reason = R_IDLE
+    elif blocked > 0 and (sm.ready[MEMORY] != 0 or sm.num_blocked < sm.num_resident):
+        reason = blocked
+    elif blocked > R_L1_BANDWIDTH:
+        reason = blocked
+    elif sm.num_blocked < sm.num_resident:
+        reason = R_ARITHMETIC
+    elif blocked > 0:
+        reason = blocked
+    else:
+        reason = R_MEMORY
+    state.reasons[reason] += 1
+    sm.last_reason = reason if reason != R_ISSUE else R_ARITHMETIC
+    sm.wake = _next_event(state, index)
+
+
+@compiled
+def place_ctas(state):  # type: ignore[no-untyped-def]
+    """Give each SM with room the next CTA, one per SM and cycle, in turn."""
+    machine = state.pool.machine[0]
+    work = state.work
+    last = machine.last_sm
+    for k in range(machine.num_sms):
+        if machine.taken >= machine.queued:
+            break
+        index = last + 1 + k
+        if index >= machine.num_sms:
+            index -= machine.num_sms
+            if index >= machine.num_sms:
+                index -= machine.num_sms
+        sm = state.sms[index]
+        if sm.free_places == 0:
+            continue
+        place = 0
+        while state.cta_at[index, place] >= 0:
+            place += 1
+        cta = machine.taken
+        machine.taken += 1
+        sm.free_places -= 1
+        machine.live_ctas += 1
+        state.cta_at[index, place] = cta
+        live = 0
+        for w in range(machine.warps_per_cta):
+            live += work.warp_rows[cta * machine.warps_per_cta + w] >= 0
+        state.warps_left[index, place] = live
+        for w in range(machine.warps_per_cta):
+            at = cta * machine.warps_per_cta + w
+            rows = work.warp_rows[at]
+            if rows >= 0:
+                machine.age += 1
+                slot = place * machine.warps_per_cta + w
+                start_warp(state, index, slot, place, work.warp_first[at], rows, machine.age)
+        sm.wake = min(sm.wake, machine.now + 1)
+        machine.last_sm = index
+
+
+__all__ = ["place_ctas", "schedule", "step_sm"]

@@ -1,0 +1,116 @@
+"""All of the machine's state, as the compiled loops pass it around."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from cachesim.timing.network import Network
+from cachesim.timing.tags import Tags
+
+
+class Pool(NamedTuple):
+    """Requests in flight. requests: `records.REQUEST`; free: int32 stack of unused ones; machine:
+    (1,) `records.MACHINE`. waits: (stages, 3) int64, cycles spent in a stage: sum, number, least.
+    """
+
+    requests: npt.NDArray[np.void]
+    free: npt.NDArray[np.int32]
+    machine: npt.NDArray[np.void]
+    waits: npt.NDArray[np.int64]
+
+
+class Work(NamedTuple):
+    """What the SMs run: rings of rows and of their requests, filled by `feed`.
+
+    instructions, operations: the static program. rows: ring of `records.ROW`. line: ring of int64
+    line numbers at the L1; mask: uint8 sectors; group: int32; written: int64 place in `granules`,
+    ring of uint32, one per sector of a stored line.
+    warp_first, warp_rows: int64 per warp of the queued CTAs, -1 rows = padding; cta_left: uint8
+    per queued CTA.
+    """
+
+    instructions: npt.NDArray[np.void]
+    operations: npt.NDArray[np.void]
+    rows: npt.NDArray[np.void]
+    line: npt.NDArray[np.int64]
+    mask: npt.NDArray[np.uint8]
+    group: npt.NDArray[np.int32]
+    written: npt.NDArray[np.int64]
+    granules: npt.NDArray[np.uint32]
+    warp_first: npt.NDArray[np.int64]
+    warp_rows: npt.NDArray[np.int64]
+    cta_left: npt.NDArray[np.uint8]
+
+
+class Route(NamedTuple):
+    """How addresses spread over a sliced level: `address.Partition`'s numbers as int64 [channels,
+    slices per channel, run shift, kind, slices, xor, line shift], and its table.
+    """
+
+    numbers: npt.NDArray[np.int64]
+    table: npt.NDArray[np.uint32]
+
+
+class Memory(NamedTuple):
+    """DRAM. C channels, B banks.
+
+    channels: (C,), banks: (C * B,), groups: (C * B,). latency_ring, entry_ring, data_ring,
+    return_ring: (C, room) int32; latency_time: (C, room) int64 core cycle, data_time: tick.
+    bits: (3, 64) int64, which address bits make up bank, row and column, -1 = end; rest_shift in
+    the machine.
+    """
+
+    channels: npt.NDArray[np.void]
+    banks: npt.NDArray[np.void]
+    groups: npt.NDArray[np.void]
+    latency_ring: npt.NDArray[np.int32]
+    latency_time: npt.NDArray[np.int64]
+    entry_ring: npt.NDArray[np.int32]
+    data_ring: npt.NDArray[np.int32]
+    data_time: npt.NDArray[np.int64]
+    return_ring: npt.NDArray[np.int32]
+    bits: npt.NDArray[np.int64]
+
+
+class State(NamedTuple):
+    """The machine.
+
+    latencies: (4, 2) int64 of the execution units, latency and initiation by kind.
+    banks: (units * banks, room) int32 the L1's delay lines. responses: (units, room) int32.
+    ejection: (SMs, room) int32; cta_at: (SMs, places) int64; warps_left: the same.
+    fifo: (units, 3, room) int32, the texture L1's reorder buffer, requests and results.
+    scheduler_masks: (schedulers,) uint64. reasons: (reasons,) int64 SM-cycles.
+    latency: (5, 2) int64, by level that gave the data: sum, number. issued: (5,) int64 by
+    kind. resident: (1,) int64 warp-cycles. moved: (5,) int64 bytes at each level's port.
+    """
+
+    pool: Pool
+    work: Work
+    latencies: npt.NDArray[np.int64]
+    sms: npt.NDArray[np.void]
+    pipes: npt.NDArray[np.void]
+    warps: npt.NDArray[np.void]
+    l1: Tags
+    gl1: Tags
+    l2: Tags
+    llc: Tags
+    up: Network
+    down: Network
+    l2_route: Route
+    llc_route: Route
+    memory: Memory
+    banks: npt.NDArray[np.int32]
+    responses: npt.NDArray[np.int32]
+    ejection: npt.NDArray[np.int32]
+    cta_at: npt.NDArray[np.int64]
+    warps_left: npt.NDArray[np.int64]
+    fifo: npt.NDArray[np.int32]
+    scheduler_masks: npt.NDArray[np.uint64]
+    reasons: npt.NDArray[np.int64]
+    latency: npt.NDArray[np.int64]
+    issued: npt.NDArray[np.int64]
+    resident: npt.NDArray[np.int64]
+    moved: npt.NDArray[np.int64]

@@ -1,0 +1,221 @@
+"""One warp's way through its program: what it does next, and what it waits for.
+
+A warp issues in order. A load waits for the warp's last integer result (its address), a store for
+all results; arithmetic instruction c of a run waits for c - 3, as three chains run side by side; a
+"wait" holds the warp until all but its last n loads are back.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from cachesim.compiled import compiled
+from cachesim.stream import STORE
+from cachesim.timing.records import MAX_LOADS, MAX_WARPS, MEMORY, WAIT, WHEEL
+
+
+@compiled
+def _block(sm, warp, until):  # type: ignore[no-untyped-def]
+    warp.waits_for = until
+    sm.num_blocked += 1
+
+
+@compiled
+def _finish(state, index, slot):  # type: ignore[no-untyped-def]
+    """The warp has exited; its CTA leaves with its last warp."""
+    machine = state.pool.machine[0]
+    sm = state.sms[index]
+    warp = state.warps[index * MAX_WARPS + slot]
+    warp.alive = 0
+    state.resident[0] += sm.num_resident * (machine.now - sm.resident_since)
+    sm.resident_since = machine.now
+    sm.num_resident -= 1
+    place = warp.cta
+    state.warps_left[index, place] -= 1
+    if state.warps_left[index, place] == 0:
+        state.work.cta_left[state.cta_at[index, place]] = 1
+        state.cta_at[index, place] = -1
+        sm.free_places += 1
+        machine.live_ctas -= 1
+        machine.ctas_done += 1
+
+
+@compiled
+def schedule(state, index, slot, earliest):  # type: ignore[no-untyped-def]
+    """Find what a warp issues next, and put it where the issue logic sees it no sooner than cycle
+    `earliest`: on a ready mask, on the wheel, or blocked until loads are back.
+    """
+    machine = state.pool.machine[0]
+    sm = state.sms[index]
+    warp = state.warps[index * MAX_WARPS + slot]
+    work = state.work
+    ready = earliest
+    kind = MEMORY
+    while True:
+        if warp.operation < warp.last_operation:
+            step = work.operations[warp.operation]
+            if step.kind == WAIT:
+                until = warp.next_load - step.count
+                if warp.oldest_load < until:
+                    _block(sm, warp, until)
+                    return
+                warp.operation += 1
+                continue
+            if warp.left < 0:
+                warp.left = step.count
+                warp.chain = 0
+            if warp.left == 0:
+                warp.operation += 1
+                warp.left = -1
+                continue
+            kind = step.kind
+            ready = max(ready, warp.chains_ready[warp.chain])
+            break
+        if warp.in_trailer:
+            if warp.oldest_load < warp.next_load or warp.stores > 0:
+                _block(sm, warp, warp.next_load)
+                return
+            _finish(state, index, slot)
+            return
+        row = work.rows[warp.row & machine.row_mask]
+        instruction = work.instructions[row.code]
+        until = warp.next_load - (MAX_LOADS - 2)
+        if instruction.num_outstanding >= 0:
+            until = max(until, warp.next_load - instruction.num_outstanding)
+        if warp.oldest_load < until:
+            _block(sm, warp, until)
+            return
+        ready = max(ready, warp.int_ready)
+        if instruction.operation == STORE:
+            for chain in range(3):
+                ready = max(ready, warp.chains_ready[chain])
+        break
+    bit = np.uint64(1) << np.uint64(slot)
+    if ready <= machine.now:
+        sm.ready[kind] |= bit
+    else:
+        sm.wheel[ready & (WHEEL - 1)] |= bit
+        sm.num_timed += 1
+
+
+@compiled
+def wake_timed(state, index):  # type: ignore[no-untyped-def]
+    """Move the warps whose time has come from the wheel to the ready masks."""
+    machine = state.pool.machine[0]
+    sm = state.sms[index]
+    due = sm.wheel[machine.now & (WHEEL - 1)]
+    if due == 0:
+        return
+    sm.wheel[machine.now & (WHEEL - 1)] = np.uint64(0)
+    slot = 0
+    while due != 0:
+        if due & np.uint64(1):
+            sm.num_timed -= 1
+            warp = state.warps[index * MAX_WARPS + slot]
+            kind = MEMORY
+            if warp.operation < warp.last_operation:
+                kind = state.work.operations[warp.operation].kind
+            sm.ready[kind] |= np.uint64(1) << np.uint64(slot)
+        due >>= np.uint64(1)
+        slot += 1
+
+
+@compiled
+def _unblock(state, warp_index):  # type: ignore[no-untyped-def]
+    warp = state.warps[warp_index]
+    if warp.waits_for < 0 or warp.oldest_load < warp.waits_for:
+        return
+    if warp.in_trailer and warp.operation >= warp.last_operation and warp.stores > 0:
+        return
+    warp.waits_for = -1
+    index = warp_index // MAX_WARPS
+    state.sms[index].num_blocked -= 1
+    schedule(state, index, warp_index % MAX_WARPS, state.pool.machine[0].now)
+
+
+@compiled
+def sector_back(state, warp_index, load):  # type: ignore[no-untyped-def]
+    """One sector of a load has reached its register."""
+    warp = state.warps[warp_index]
+    at = load & (MAX_LOADS - 1)
+    warp.pending[at] -= 1
+    if warp.pending[at] > 0 or load != warp.oldest_load:
+        return
+    while (
+        warp.oldest_load < warp.next_load and warp.pending[warp.oldest_load & (MAX_LOADS - 1)] == 0
+    ):
+        warp.oldest_load += 1
+    _unblock(state, warp_index)
+
+
+@compiled
+def store_done(state, warp_index):  # type: ignore[no-untyped-def]
+    """One sector of a store was acknowledged."""
+    state.warps[warp_index].stores -= 1
+    _unblock(state, warp_index)
+
+
+@compiled
+def advance(state, index, slot, now, again):  # type: ignore[no-untyped-def]
+    """The warp has issued its next instruction; find the one after it. again: it may issue once
+    more in this cycle.
+    """
+    machine = state.pool.machine[0]
+    warp = state.warps[index * MAX_WARPS + slot]
+    work = state.work
+    if warp.operation < warp.last_operation:
+        warp.left -= 1
+        warp.chain = warp.chain + 1 if warp.chain < 2 else 0
+        if warp.left == 0:
+            warp.operation += 1
+            warp.left = -1
+    else:
+        warp.row += 1
+        warp.rows_left -= 1
+        if warp.rows_left > 0:
+            instruction = work.instructions[work.rows[warp.row & machine.row_mask].code]
+            warp.operation = instruction.first
+            warp.last_operation = instruction.last
+        else:
+            warp.operation = machine.trailer_first
+            warp.last_operation = machine.trailer_last
+            warp.in_trailer = 1
+        warp.left = -1
+    schedule(state, index, slot, now if again else now + 1)
+
+
+@compiled
+def start_warp(state, index, slot, place, first, rows, age):  # type: ignore[no-untyped-def]
+    """Put a warp into a slot of an SM; it may issue in the next cycle."""
+    machine = state.pool.machine[0]
+    sm = state.sms[index]
+    work = state.work
+    warp = state.warps[index * MAX_WARPS + slot]
+    warp.row = first
+    warp.rows_left = rows
+    warp.left = -1
+    warp.chain = 0
+    warp.parity = 0
+    warp.waits_for = -1
+    warp.next_load = 0
+    warp.oldest_load = 0
+    warp.stores = 0
+    warp.cta = place
+    warp.alive = 1
+    warp.age = age
+    warp.int_ready = 0
+    for chain in range(3):
+        warp.chains_ready[chain] = 0
+    if rows > 0:
+        instruction = work.instructions[work.rows[first & machine.row_mask].code]
+        warp.operation = instruction.first
+        warp.last_operation = instruction.last
+        warp.in_trailer = 0
+    else:
+        warp.operation = machine.trailer_first
+        warp.last_operation = machine.trailer_last
+        warp.in_trailer = 1
+    state.resident[0] += sm.num_resident * (machine.now - sm.resident_since)
+    sm.resident_since = machine.now
+    sm.num_resident += 1
+    schedule(state, index, slot, machine.now + 1 + machine.cta_launch_cycles)
