@@ -15,6 +15,10 @@ from cachesim.timing.pipe import inject, locate
 from cachesim.timing.records import NEVER, PATH_FIFO, S_REPLY, S_REQUEST, WRITEBACK
 from cachesim.timing.slice import arrive, come_back, step_cache
 from cachesim.timing.sm import place_ctas, step_sm
+from cachesim.timing.state import State
+from cachesim.timing.view import opener, table_of
+
+_open_state = opener("State")
 
 #: Why the loop stopped.
 DONE, NEEDS_CTAS, NEEDS_POOL, STUCK, PAUSED = range(5)
@@ -299,11 +303,12 @@ def _next_cycle(state):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def run(state, pause):  # type: ignore[no-untyped-def]
+def _run(address, pause):  # type: ignore[no-untyped-def]
     """Run until the launch is done, more CTAs are needed, nothing moves any more, or cycle `pause`.
 
     Returns why. The machine's `now` is the cycle to go on with.
     """
+    state = _open_state(address)
     machine = state.pool.machine[0]
     while True:
         if not machine.complete and machine.queued - machine.taken < machine.num_sms:
@@ -350,6 +355,12 @@ def run(state, pause):  # type: ignore[no-untyped-def]
             machine.tick_remainder = total - ticks * machine.core_hz
             machine.tick += ticks
         machine.now = following
+
+
+def run(state: State, pause: int) -> int:
+    """Run the machine until one of the reasons above, or cycle `pause`; returns the reason."""
+    table = table_of("State", state)
+    return int(_run(table.address, pause))
 
 
 __all__ = ["DONE", "NEEDS_CTAS", "NEEDS_POOL", "PAUSED", "STUCK", "run"]

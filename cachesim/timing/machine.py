@@ -397,6 +397,8 @@ def build(gpu: Gpu, fetch_path: str, num_groups: int) -> State:
     sms["last_reason"] = records.R_IDLE
     sms["last_step"] = -1
     sms["last_issued"] = -1
+    sms["issued_slot"] = -1
+    sms["collector_slot"] = -1
     pipes = np.zeros(num_sms * units, records.PIPE)
     for field in ("warp", "next_writeback", "next_global"):
         pipes[field] = -1

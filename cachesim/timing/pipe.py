@@ -21,6 +21,7 @@ from cachesim.timing.records import (
     FAIL,
     HIT,
     MAX_WARPS,
+    NEVER,
     PATH_BYPASS,
     PATH_FIFO,
     R_INTERCONNECT,
@@ -339,7 +340,8 @@ def _take_instruction(state, index, unit):  # type: ignore[no-untyped-def]
         if pipe.blocked == 0:
             pipe.blocked = R_L1_BANDWIDTH
         return
-    best, oldest = -1, now + 1
+    # With collectors this is the order of issue, and what is there may be taken.
+    best, oldest = -1, NEVER if machine.collector_units > 0 else now + 1
     for s in range(machine.num_schedulers):
         if sm.queue_count[s] == 0:
             continue

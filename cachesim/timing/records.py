@@ -14,6 +14,7 @@ MAX_BANKS = 64
 MAX_LOADS = 64
 MAX_DRAM_BANKS = 64
 MAX_MEMORY_QUEUE = 64
+MAX_COLLECTORS = 8
 MAX_SUBSLICES = 8
 #: Slots of the wheel that wakes warps: a power of two above every unit's latency.
 WHEEL = 512
@@ -168,6 +169,21 @@ SM = np.dtype(
         ("queue_warp", "i4", (MAX_SCHEDULERS, MAX_MEMORY_QUEUE)),
         ("queue_time", "i8", (MAX_SCHEDULERS, MAX_MEMORY_QUEUE)),
         ("queue_row", "i8", (MAX_SCHEDULERS, MAX_MEMORY_QUEUE)),
+        # GPGPU-Sim's operand collectors: issued[kind, scheduler], then collector[scheduler, unit].
+        ("num_collecting", "i4"),
+        ("issued_slot", "i4", (5, MAX_SCHEDULERS)),
+        ("issued_order", "i8", (5, MAX_SCHEDULERS)),
+        ("issued_chain", "i4", (5, MAX_SCHEDULERS)),
+        ("issued_row", "i8", (MAX_SCHEDULERS,)),
+        ("issued_load", "i4", (MAX_SCHEDULERS,)),
+        ("collector_slot", "i4", (MAX_SCHEDULERS, MAX_COLLECTORS)),
+        ("collector_kind", "i4", (MAX_SCHEDULERS, MAX_COLLECTORS)),
+        ("collector_chain", "i4", (MAX_SCHEDULERS, MAX_COLLECTORS)),
+        ("collector_ready", "i4", (MAX_SCHEDULERS, MAX_COLLECTORS)),
+        ("collector_order", "i8", (MAX_SCHEDULERS, MAX_COLLECTORS)),
+        ("collector_row", "i8", (MAX_SCHEDULERS, MAX_COLLECTORS)),
+        ("collector_load", "i4", (MAX_SCHEDULERS, MAX_COLLECTORS)),
+        ("order", "i8"),
         ("queue_load", "i4", (MAX_SCHEDULERS, MAX_MEMORY_QUEUE)),
         ("eject_head", "i4"),
         ("eject_count", "i4"),
@@ -223,6 +239,7 @@ WARP = np.dtype(
         ("chain", "i4"),
         ("parity", "i4"),
         ("in_trailer", "i4"),
+        ("waits_chain", "i4"),  # for the unknown end of this chain, or -1
         ("waits_for", "i4"),  # loads up to this sequence number must be back; -1 = not waiting
         ("next_load", "i4"),
         ("oldest_load", "i4"),

@@ -56,11 +56,120 @@ def _pick(state, index, scheduler, candidates):  # type: ignore[no-untyped-def]
 
 
 @compiled
+def _unit_of(machine, kind):  # type: ignore[no-untyped-def]
+    return FP32 if kind == INT and machine.int_on_fp32 else kind
+
+
+@compiled
+def _dispatch(state, index, s, c):  # type: ignore[no-untyped-def]
+    """Move a collected instruction to its unit, if that has room. Returns whether it did."""
+    machine = state.pool.machine[0]
+    sm = state.sms[index]
+    now = machine.now
+    kind = sm.collector_kind[s, c]
+    if kind == MEMORY:
+        if sm.queue_count[s] > 0:
+            return False
+        sm.queue_head[s] = 0
+        sm.queue_count[s] = 1
+        sm.queue_warp[s, 0] = sm.collector_slot[s, c]
+        # The load/store unit takes the oldest of those that are there.
+        sm.queue_time[s, 0] = sm.collector_order[s, c]
+        sm.queue_row[s, 0] = sm.collector_row[s, c]
+        sm.queue_load[s, 0] = sm.collector_load[s, c]
+    else:
+        unit = _unit_of(machine, kind)
+        if sm.unit_free[s, unit] > now + 1:
+            return False
+        start = max(now + 1, sm.unit_free[s, unit])
+        sm.unit_free[s, unit] = start + state.latencies[kind, 1]
+        done = start + state.latencies[kind, 0] + machine.result_cycles - _AHEAD
+        slot = sm.collector_slot[s, c]
+        warp = state.warps[index * MAX_WARPS + slot]
+        warp.chains_ready[sm.collector_chain[s, c]] = done
+        if kind == INT:
+            warp.int_ready = done
+        if warp.waits_chain >= 0:
+            warp.waits_chain = -1
+            schedule(state, index, slot, now + 1)
+    sm.collector_slot[s, c] = -1
+    sm.num_collecting -= 1
+    return True
+
+
+@compiled
+def _collect(state, index):  # type: ignore[no-untyped-def]
+    """One cycle of GPGPU-Sim's operand collectors: two steps of dispatch, reads, allocation.
+
+    A scheduler's collectors are tried in their order, so that under pressure a later one waits; the
+    instructions of one kind enter in the order of issue, the oldest blocking the others.
+    """
+    machine = state.pool.machine[0]
+    sm = state.sms[index]
+    for _ in range(2):
+        for s in range(machine.num_schedulers):
+            for c in range(machine.collector_units):
+                if sm.collector_slot[s, c] >= 0:
+                    if sm.collector_ready[s, c]:
+                        _dispatch(state, index, s, c)
+                    else:
+                        sm.collector_ready[s, c] = 1
+        for kind in range(5):
+            while True:
+                oldest, order = -1, NEVER
+                for s in range(machine.num_schedulers):
+                    if sm.issued_slot[kind, s] >= 0 and sm.issued_order[kind, s] < order:
+                        oldest, order = s, sm.issued_order[kind, s]
+                if oldest < 0:
+                    break
+                free = -1
+                for c in range(machine.collector_units):
+                    if sm.collector_slot[oldest, c] < 0:
+                        free = c
+                        break
+                if free < 0:
+                    break
+                sm.collector_slot[oldest, free] = sm.issued_slot[kind, oldest]
+                sm.collector_kind[oldest, free] = kind
+                sm.collector_ready[oldest, free] = 0
+                sm.collector_order[oldest, free] = order
+                sm.collector_chain[oldest, free] = sm.issued_chain[kind, oldest]
+                if kind == MEMORY:
+                    sm.collector_row[oldest, free] = sm.issued_row[oldest]
+                    sm.collector_load[oldest, free] = sm.issued_load[oldest]
+                sm.issued_slot[kind, oldest] = -1
+
+
+@compiled
+def _enter_collectors(state, index, s, slot, warp, kind):  # type: ignore[no-untyped-def]
+    """Issue to the collectors' entry."""
+    machine = state.pool.machine[0]
+    sm = state.sms[index]
+    place = kind if kind == MEMORY else _unit_of(machine, kind)
+    sm.order += 1
+    sm.num_collecting += 1
+    sm.issued_slot[place, s] = slot
+    sm.issued_order[place, s] = sm.order
+    sm.issued_chain[place, s] = warp.chain
+    if kind == MEMORY:
+        row = state.work.rows[warp.row & machine.row_mask]
+        sm.issued_row[s] = warp.row
+        if state.work.instructions[row.code].operation != STORE:
+            sm.issued_load[s] = warp.next_load
+            warp.pending[warp.next_load & (MAX_LOADS - 1)] = max(1, row.sectors)
+            warp.next_load += 1
+    else:
+        warp.chains_ready[warp.chain] = NEVER
+        if kind == INT:
+            warp.int_ready = NEVER
+
+
+@compiled
 def _start_arithmetic(state, index, scheduler, warp, kind, now):  # type: ignore[no-untyped-def]
     """Send an instruction to its unit, and note when its result is there."""
     machine = state.pool.machine[0]
     sm = state.sms[index]
-    unit = FP32 if kind == INT and machine.int_on_fp32 else kind
+    unit = _unit_of(machine, kind)
     start = max(now + _AHEAD, sm.unit_free[scheduler, unit])
     sm.unit_free[scheduler, unit] = start + state.latencies[kind, 1]
     done = start + state.latencies[kind, 0] + machine.result_cycles - _AHEAD
@@ -90,6 +199,18 @@ def _start_memory(state, index, scheduler, slot, warp, now):  # type: ignore[no-
 
 
 @compiled
+def _has_room(state, index, scheduler, kind, now):  # type: ignore[no-untyped-def]
+    """Whether a scheduler may issue an instruction of a kind."""
+    machine = state.pool.machine[0]
+    sm = state.sms[index]
+    if machine.collector_units > 0:
+        return sm.issued_slot[_unit_of(machine, kind), scheduler] < 0
+    if kind == MEMORY:
+        return sm.queue_count[scheduler] < machine.memory_queue
+    return sm.unit_free[scheduler, _unit_of(machine, kind)] <= now + _AHEAD
+
+
+@compiled
 def _issue(state, index, scheduler):  # type: ignore[no-untyped-def]
     """Issue up to `issue_per_warp` instructions of one warp. Returns how many."""
     machine = state.pool.machine[0]
@@ -97,15 +218,9 @@ def _issue(state, index, scheduler):  # type: ignore[no-untyped-def]
     now = machine.now
     mine = state.scheduler_masks[scheduler]
     candidates = U64(0)
-    waiting = sm.queue_count[scheduler]
-    if waiting < machine.memory_queue:
-        candidates = sm.ready[MEMORY] & mine
-    # Memory instructions that wait hold the operand collectors.
-    if machine.collector_units == 0 or waiting <= machine.collector_units:
-        for kind in range(4):
-            unit = FP32 if kind == INT and machine.int_on_fp32 else kind
-            if sm.ready[kind] & mine and sm.unit_free[scheduler, unit] <= now + _AHEAD:
-                candidates |= sm.ready[kind] & mine
+    for kind in range(5):
+        if sm.ready[kind] & mine and _has_room(state, index, scheduler, kind, now):
+            candidates |= sm.ready[kind] & mine
     if candidates == 0:
         return 0
     slot = _pick(state, index, scheduler, candidates)
@@ -117,17 +232,16 @@ def _issue(state, index, scheduler):  # type: ignore[no-untyped-def]
         kind = 0
         while (sm.ready[kind] & bit) == 0:
             kind += 1
-        unit = FP32 if kind == INT and machine.int_on_fp32 else kind
-        if issued > 0:
-            if machine.different_units and unit == previous:
-                break
-            if kind == MEMORY:
-                if sm.queue_count[scheduler] >= machine.memory_queue:
-                    break
-            elif sm.unit_free[scheduler, unit] > now + _AHEAD:
-                break
+        unit = _unit_of(machine, kind)
+        if issued > 0 and (
+            (machine.different_units and unit == previous)
+            or not _has_room(state, index, scheduler, kind, now)
+        ):
+            break
         sm.ready[kind] &= ~bit
-        if kind == MEMORY:
+        if machine.collector_units > 0:
+            _enter_collectors(state, index, scheduler, slot, warp, kind)
+        elif kind == MEMORY:
             _start_memory(state, index, scheduler, slot, warp, now)
         else:
             _start_arithmetic(state, index, scheduler, warp, kind, now)
@@ -159,6 +273,8 @@ def _next_event(state, index):  # type: ignore[no-untyped-def]
     for kind in range(5):
         if sm.ready[kind] != 0:
             return now + 1
+    if sm.num_collecting > 0:
+        return now + 1
     soonest = NEVER
     for s in range(machine.num_schedulers):
         if sm.queue_count[s] > 0:
@@ -212,6 +328,8 @@ def step_sm(state, index):  # type: ignore[no-untyped-def]
         blocked = max(blocked, state.pipes[unit].blocked)
     if sm.num_timed > 0:
         wake_timed(state, index)
+    if sm.num_collecting > 0:
+        _collect(state, index)
     issued = 0
     if sm.num_resident > 0:
         for s in range(machine.num_schedulers):

@@ -7,8 +7,10 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from cachesim.timing import records
 from cachesim.timing.network import Network
 from cachesim.timing.tags import Tags
+from cachesim.timing.view import define
 
 
 class Pool(NamedTuple):
@@ -114,3 +116,112 @@ class State(NamedTuple):
     issued: npt.NDArray[np.int64]
     resident: npt.NDArray[np.int64]
     moved: npt.NDArray[np.int64]
+
+
+_I64, _I32, _U32, _U8 = np.int64, np.int32, np.uint32, np.uint8
+
+define(
+    "Pool",
+    {
+        "requests": (records.REQUEST, 1),
+        "free": (_I32, 1),
+        "machine": (records.MACHINE, 1),
+        "waits": (_I64, 2),
+    },
+)
+define(
+    "Work",
+    {
+        "instructions": (records.INSTRUCTION, 1),
+        "operations": (records.OPERATION, 1),
+        "rows": (records.ROW, 1),
+        "line": (_I64, 1),
+        "mask": (_U8, 1),
+        "group": (_I32, 1),
+        "written": (_I64, 1),
+        "granules": (_U32, 1),
+        "warp_first": (_I64, 1),
+        "warp_rows": (_I64, 1),
+        "cta_left": (_U8, 1),
+    },
+)
+define("Route", {"numbers": (_I64, 1), "table": (_U32, 2)})
+define(
+    "Memory",
+    {
+        "channels": (records.CHANNEL, 1),
+        "banks": (records.BANK, 1),
+        "groups": (records.BANK_GROUP, 1),
+        "latency_ring": (_I32, 2),
+        "latency_time": (_I64, 2),
+        "entry_ring": (_I32, 2),
+        "data_ring": (_I32, 2),
+        "data_time": (_I64, 2),
+        "return_ring": (_I32, 2),
+        "bits": (_I64, 2),
+    },
+)
+define(
+    "Tags",
+    {
+        "level": (records.LEVEL, 1),
+        "nodes": (records.NODE, 1),
+        "lines": (records.LINE, 1),
+        "held": (_U32, 1),
+        "owner": (_I32, 1),
+        "sets": (records.SET, 1),
+        "buckets": (_I32, 1),
+        "mshrs": (records.MSHR, 1),
+        "mshr_buckets": (_I32, 1),
+        "set_table": (_U32, 2),
+        "counters": (_I64, 2),
+        "outcomes": (_I64, 2),
+        "queues": (_I32, 3),
+    },
+)
+define(
+    "Network",
+    {
+        "inputs": (records.PORT, 1),
+        "in_ring": (_I32, 2),
+        "in_time": (_I64, 2),
+        "in_out": (_I32, 2),
+        "in_flits": (_I32, 2),
+        "outputs": (records.OUTLET, 1),
+        "out_ring": (_I32, 2),
+        "out_time": (_I64, 2),
+        "scalars": (_I64, 1),
+    },
+)
+define(
+    "State",
+    {
+        "pool": "Pool",
+        "work": "Work",
+        "latencies": (_I64, 2),
+        "sms": (records.SM, 1),
+        "pipes": (records.PIPE, 1),
+        "warps": (records.WARP, 1),
+        "l1": "Tags",
+        "gl1": "Tags",
+        "l2": "Tags",
+        "llc": "Tags",
+        "up": "Network",
+        "down": "Network",
+        "l2_route": "Route",
+        "llc_route": "Route",
+        "memory": "Memory",
+        "banks": (_I32, 2),
+        "responses": (_I32, 2),
+        "ejection": (_I32, 2),
+        "cta_at": (_I64, 2),
+        "warps_left": (_I64, 2),
+        "fifo": (_I32, 3),
+        "scheduler_masks": (np.uint64, 1),
+        "reasons": (_I64, 1),
+        "latency": (_I64, 2),
+        "issued": (_I64, 1),
+        "resident": (_I64, 1),
+        "moved": (_I64, 1),
+    },
+)

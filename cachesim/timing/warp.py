@@ -11,7 +11,7 @@ import numpy as np
 
 from cachesim.compiled import compiled
 from cachesim.stream import STORE
-from cachesim.timing.records import MAX_LOADS, MAX_WARPS, MEMORY, WAIT, WHEEL
+from cachesim.timing.records import MAX_LOADS, MAX_WARPS, MEMORY, NEVER, WAIT, WHEEL
 
 
 @compiled
@@ -90,6 +90,10 @@ def schedule(state, index, slot, earliest):  # type: ignore[no-untyped-def]
             for chain in range(3):
                 ready = max(ready, warp.chains_ready[chain])
         break
+    if ready >= NEVER:
+        # Its last result is still being collected; `collect` will say when it is there.
+        warp.waits_chain = 0
+        return
     bit = np.uint64(1) << np.uint64(slot)
     if ready <= machine.now:
         sm.ready[kind] |= bit
@@ -197,6 +201,7 @@ def start_warp(state, index, slot, place, first, rows, age):  # type: ignore[no-
     warp.chain = 0
     warp.parity = 0
     warp.waits_for = -1
+    warp.waits_chain = -1
     warp.next_load = 0
     warp.oldest_load = 0
     warp.stores = 0
