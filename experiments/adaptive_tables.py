@@ -7,11 +7,13 @@ from collections.abc import Sequence
 
 import pandas as pd
 
-from experiments.adaptive_vs_fixed import METHODS, MIPPED_TEXTURE, PASSES
-from experiments.tables import MISSING, Column, Table, three_digits
+from experiments.adaptive_vs_fixed import METHODS, MIPPED_TEXTURE, PAPER_TIME_RATIO, PASSES
+from experiments.tables import MISSING, Column, Table, show_value, three_digits
 
 DEMAND_NAMES = {"l1_bytes": "L1", "l2_bytes": "L2", "dram_bytes": "DRAM"}
 RATE_NAMES = {"l1_miss_rate": "L1", "l2_miss_rate": "L2"}
+#: Numbers of the central table that only a timed run has.
+TIME_NAMES = ("cycles", "time_ms")
 #: Why adaptive can ask more of a level, and why its miss rate can rise while its misses fall.
 EXTRA = (
     "Only adaptive reads a history in the sampling pass and writes one in the update pass, and the "
@@ -59,7 +61,7 @@ def quality_table(quality: pd.DataFrame, title: str, num_frames: int) -> Table:
 
 def demand_table(demand: pd.DataFrame, ratios: pd.DataFrame, title: str, size: str) -> Table:
     """The central table: fixed, adaptive, and adaptive / fixed of all passes and of sampling."""
-    numbers = [*DEMAND_NAMES, *RATE_NAMES]
+    numbers = [*DEMAND_NAMES, *RATE_NAMES, *TIME_NAMES]
     of_frame = demand[demand["passes"] == "all"]
     by_key = ratios.set_index(["scene", "gpu", "passes"])
     rows = []
@@ -67,14 +69,12 @@ def demand_table(demand: pd.DataFrame, ratios: pd.DataFrame, title: str, size: s
         for _, row in part.iterrows():
             shown = {"scene": scene, "gpu": gpu, "method": row["method"]}
             shown["lane_fetches"] = f"{row['lane_fetches'] / 1e6:,.1f}"
-            for name in numbers:
-                in_mb = name in DEMAND_NAMES
-                shown[name] = f"{row[name] / 1e6:,.1f}" if in_mb else f"{row[name]:.3f}"
-            rows.append(shown)
+            rows.append(shown | {name: _demand_cell(name, row[name]) for name in numbers})
         for passes, name in (("all", "ratio"), ("sampling", "of sampling")):
             ratio = by_key.loc[(scene, gpu, passes)]
             shown = {"scene": scene, "gpu": gpu, "method": name}
-            rows.append(shown | {n: f"{ratio[n]:.3f}" for n in ("lane_fetches", *numbers)})
+            names = ("lane_fetches", *numbers)
+            rows.append(shown | {n: show_value(float(ratio[n]), ".3f") for n in names})
     columns = (
         Column("scene", "scene"),
         Column("gpu", "GPU"),
@@ -85,8 +85,21 @@ def demand_table(demand: pd.DataFrame, ratios: pd.DataFrame, title: str, size: s
         Column("dram_bytes", "DRAM (MB)", numeric=True),
         Column("l1_miss_rate", "L1 miss rate", numeric=True),
         Column("l2_miss_rate", "L2 miss rate", numeric=True),
+        Column("cycles", "cycles (M)", numeric=True),
+        Column("time_ms", "ms", numeric=True),
     )
     return Table(title, pd.DataFrame(rows), columns, tuple(findings(ratios, size)))
+
+
+def _demand_cell(name: str, value: float) -> str:
+    """One number of the central table: MB, millions of cycles, ms, or a rate; "-" where none is."""
+    if math.isnan(value):
+        return MISSING
+    if name in DEMAND_NAMES:
+        return f"{value / 1e6:,.1f}"
+    if name in TIME_NAMES:
+        return three_digits(value / 1e6 if name == "cycles" else value)
+    return f"{value:.3f}"
 
 
 def findings(ratios: pd.DataFrame, size: str) -> list[str]:
@@ -119,8 +132,22 @@ def findings(ratios: pd.DataFrame, size: str) -> list[str]:
         above = _where(whole, name)
         text += f"Higher for adaptive: {above}. {FIRST_TOUCH}" if above else "Lower everywhere."
         lines.append(text)
+    if "cycles" in ratios and whole["cycles"].notna().any():
+        lines.append(_cycles_finding(*(r[r["cycles"].notna()] for r in (whole, sampling))))
     lines.append("The paper's miss rates are a plot whose values we do not have to compare with.")
     return lines
+
+
+def _cycles_finding(whole: pd.DataFrame, sampling: pd.DataFrame) -> str:
+    """The sentence on cycles: where adaptive takes fewer, and what the paper's times say."""
+    text = f"Cycles, adaptive / fixed: {_span(whole, 'cycles')}, kernel launches included; in the "
+    text += f"sampling pass {_span(sampling, 'cycles')}, where the paper's times on a Quadro P4000 "
+    text += f"are {min(PAPER_TIME_RATIO.values()):.2f} to {max(PAPER_TIME_RATIO.values()):.2f}. "
+    text += f"Timed on {', '.join(whole['gpu'].unique())}. "
+    above = _where(sampling, "cycles")
+    if above:
+        return text + f"Disagrees with the paper, which shows fewer for adaptive: {above}."
+    return text + "Fewer for adaptive in every sampling pass, as the paper shows."
 
 
 def _span(ratios: pd.DataFrame, name: str) -> str:

@@ -1,15 +1,16 @@
 """The dissertation's central comparison: the same frame with a fixed and with an adaptive count.
 
 In go scenes and GPUs; out come, per scene, GPU and method, the demand and miss rate of each cache
-level, in total and per mip of the irradiance texture, and the quality of both pictures. The slides
-give the comparison for one GPU (TITAN X Pascal, side view) as plots without axes, so only
-directions can be held against ours.
+level, in total and per mip of the irradiance texture, the cycles, and the quality of both pictures.
+The slides give the comparison for one GPU (TITAN X Pascal, side view) as plots without axes, so
+only directions can be held against ours.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import pandas as pd
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
     from cachesim import Report
     from cachesim.config import Gpu
     from cachesim.report import Part
+    from cachesim.timing.results import TimingResult
     from kernels.device import Device
     from kernels.gbuffer import GBuffer
 
@@ -45,7 +47,8 @@ class SceneResult:
     """One scene, both methods.
 
     label: the scene's name in tables. frames, psnr_db, reports: by method; reports one per GPU;
-    psnr_db["accumulated"] is of adaptive's frames blended over time.
+    psnr_db["accumulated"] is of adaptive's frames blended over time. timings: by method and name
+    of the GPU, of those that were timed.
     """
 
     label: str
@@ -53,6 +56,7 @@ class SceneResult:
     frames: dict[str, Frame]
     psnr_db: dict[str, float]
     reports: dict[str, list[Report]]
+    timings: dict[str, dict[str, TimingResult]] = field(default_factory=dict)
 
 
 def compare(
@@ -62,6 +66,7 @@ def compare(
     *,
     num_frames: int,
     method: Method | None = None,
+    timed: Sequence[Gpu] = (),
     device: Device | None = None,
     clock: StageClock | None = None,
     step: Callable[[str], None] = lambda _: None,
@@ -74,6 +79,8 @@ def compare(
         gpus: what to count on, all in one pass over each recording.
         num_frames: frames of the adaptive run; the last one is shown, measured and traced.
         method: settings that both methods share.
+        timed: which of the GPUs to time as well, in a second pass over each recording; counters
+            are those of the first everywhere.
         device: where to render.
         clock: is given the time of each stage.
         step: is told the next stage's name.
@@ -81,6 +88,7 @@ def compare(
     clock = clock or StageClock()
     shared = method or Method()
     frames, qualities, reports = {}, {}, {}
+    timings: dict[str, dict[str, TimingResult]] = {}
 
     def stage(name: str) -> Any:
         step(f"{label}: {name}")
@@ -100,7 +108,11 @@ def compare(
         with stage(f"recording and counting {kind}"):
             trace = record(gbuffer, chosen, num_frames=count, device=device)
             reports[kind] = simulate_all(trace, gpus)
-    return SceneResult(label, gbuffer, frames, qualities, reports)
+        if timed:
+            with stage(f"recording and timing {kind}"):
+                runs = simulate_all(trace, timed, timing=True)
+                timings[kind] = {r.gpu: r.timing for r in runs if r.timing is not None}
+    return SceneResult(label, gbuffer, frames, qualities, reports, timings)
 
 
 def mean_count(result: SceneResult, method: str) -> float:
@@ -134,7 +146,8 @@ def quality_frame(results: Sequence[SceneResult]) -> pd.DataFrame:
 def demand_frame(results: Sequence[SceneResult]) -> pd.DataFrame:
     """One row per scene, GPU, passes ("all" or "sampling") and method.
 
-    Lane fetches, demand in bytes, miss rates; columns of levels that a GPU lacks are empty.
+    Lane fetches, demand in bytes, miss rates, cycles and milliseconds; columns of levels that a GPU
+    lacks are empty, and so are cycles and milliseconds of GPUs that were not timed.
     """
     rows = []
     for result in results:
@@ -144,7 +157,8 @@ def demand_frame(results: Sequence[SceneResult]) -> pd.DataFrame:
                     report = result.reports[method][gpu]
                     key = {"scene": result.label, "gpu": report.gpu}
                     key |= {"passes": passes, "method": method}
-                    rows.append(key | _totals(report, passes))
+                    timing = result.timings.get(method, {}).get(report.gpu)
+                    rows.append(key | _totals(report, passes) | timing_totals(timing, passes))
     return pd.DataFrame(rows)
 
 
@@ -159,6 +173,17 @@ def _totals(report: Report, passes: str) -> dict[str, Any]:
         row |= {f"{n}_bytes": c.demand_bytes for n, c in counters.items()}
         row["dram_bytes"] = sum(p.dram.bytes for p in parts)
     return row | {f"{name}_miss_rate": c.miss_rate for name, c in counters.items()}
+
+
+def timing_totals(timing: TimingResult | None, passes: str) -> dict[str, float]:
+    """Cycles and milliseconds of the whole frame, or of its sampling pass; NaN without timing."""
+    if timing is None:
+        return {"cycles": math.nan, "time_ms": math.nan}
+    parts = [timing.total] if passes == "all" else [p for p in timing.passes if p.name == passes]
+    return {
+        "cycles": float(sum(p.cycles for p in parts)),
+        "time_ms": sum(timing.milliseconds(p) for p in parts),
+    }
 
 
 def ratio_frame(demand: pd.DataFrame) -> pd.DataFrame:

@@ -16,16 +16,21 @@ import typer
 from experiments import (
     bench,
     bound,
+    cache_table,
     check,
     demo,
     doctor,
+    export,
+    import_config,
     info,
     layouts,
+    p4000_times,
     prefilter,
     presets,
     record,
     render,
     run,
+    sensitivity,
     sweep,
 )
 from traces.errors import InputError, WorkError
@@ -43,10 +48,13 @@ app = typer.Typer(
 )
 for module in (
     demo,
+    cache_table,
+    p4000_times,
     prefilter,
     record,
     run,
     sweep,
+    sensitivity,
     bound,
     presets,
     layouts,
@@ -54,9 +62,11 @@ for module in (
     check,
     render,
     bench,
+    export,
+    import_config,
     doctor,
 ):
-    app.command(module.__name__.rpartition(".")[2])(module.command)
+    app.command(module.__name__.rpartition(".")[2].replace("_", "-"))(module.command)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -19,7 +19,8 @@ def console(stderr: bool = False) -> Console:
     """A console as wide as the terminal, or `PLAIN_WIDTH` columns in a file or pipe."""
     from rich.console import Console
 
-    made = Console(stderr=stderr, highlight=False)
+    # `:m:` in a cache's string is no emoji.
+    made = Console(stderr=stderr, highlight=False, emoji=False)
     if not made.is_terminal:
         made.width = PLAIN_WIDTH
     return made

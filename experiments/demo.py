@@ -19,8 +19,11 @@ SCENES = "close,ear,front"
 GPUS = "titan-x-pascal,rtx-2080-ti,rx-5700-xt"
 SIZE, FULL_SIZE = "960x540", "1920x1080"
 #: Measured on two cores: seconds of a first run whatever its size, and per million scattering
-#: pixels for rendering, and for counting on each GPU.
-FIRST_S, RENDER_S, COUNT_S = 15.0, 15.0, 15.0
+#: pixels for rendering, for counting on each GPU, and for timing on each GPU.
+FIRST_S, RENDER_S, COUNT_S, TIME_S = 15.0, 15.0, 15.0, 60.0
+#: Which of --gpus are timed.
+TIMED = ("none", "first", "all")
+TIMING_HELP = "Which of the GPUs to time as well: none, first or all."
 MESH_HELP = "A mesh instead of the procedural head; --scenes then names cameras."
 
 
@@ -39,20 +42,23 @@ def command(
     frames: Annotated[
         int, typer.Option("--frames", metavar="N", min=2, help="Frames of the adaptive run.")
     ] = 8,
+    timing: Annotated[str, typer.Option("--timing", metavar="WHICH", help=TIMING_HELP)] = "none",
     device: DeviceName = None,
     output: Folder = Path("out"),
 ) -> None:
-    """Compare fixed with adaptive sampling: demand and miss rates, tables, pictures."""
+    """Compare fixed with adaptive sampling: demand, miss rates and cycles, tables, pictures."""
     from experiments.console import StageClock, progress, remark
     from experiments.options import parse_image_size, scene_arguments
     from experiments.output import input_file, output_folder
-    from traces.errors import InputError
+    from traces.errors import InputError, unknown
 
     clock = StageClock()
     if full and size is not None:
         raise InputError(f"--size {size}: --full has a size of its own, {FULL_SIZE}")
     width, height = parse_image_size(size or (FULL_SIZE if full else SIZE))
     scene_names = parse_names(scenes, "--scenes")
+    if timing not in TIMED:
+        raise unknown("choice", timing, TIMED, "--timing")
     if mesh is not None:
         input_file(mesh)
     maps = scene_arguments(str(mesh or scene_names[0]), None, albedo_map, normal_map)
@@ -62,6 +68,7 @@ def command(
     from cachesim.first_use import compile_loops
 
     machines = [presets.load(name) for name in parse_names(gpus, "--gpus")]
+    timed = machines_to_time(machines, timing)
     with clock.stage("loading the libraries"):
         from experiments import adaptive_vs_fixed as study
         from kernels.device import open_device
@@ -82,10 +89,10 @@ def command(
             }
         with progress("compiling the simulator"), clock.stage("compiling, beside the scenes"):
             compiling.result()
-    seconds = estimate_s(list(gbuffers.values()), len(machines))
+    seconds = estimate_s(list(gbuffers.values()), len(machines), len(timed))
     remark(f"{width}x{height} on {opened.name}: about {seconds:,.0f} s on two cores")
     results: list[SceneResult] = []
-    with progress("starting", 5 * len(scene_names)) as bar:
+    with progress("starting", (7 if timed else 5) * len(scene_names)) as bar:
 
         def step(text: str) -> None:
             bar.describe(text)
@@ -98,6 +105,7 @@ def command(
                     gbuffer,
                     machines,
                     num_frames=frames,
+                    timed=timed,
                     device=opened,
                     clock=clock,
                     step=step,
@@ -109,10 +117,25 @@ def command(
         remark(line)
 
 
-def estimate_s(gbuffers: Sequence[GBuffer], num_gpus: int) -> float:
+def machines_to_time(machines: Sequence[Gpu], which: str) -> list[Gpu]:
+    """Those of the GPUs that are timed, without those that the timing model cannot run.
+
+    which: one of `TIMED`.
+    """
+    from experiments.console import remark
+    from experiments.timing_tables import timing_refusal
+
+    chosen = list(machines[: {"none": 0, "first": 1, "all": len(machines)}[which]])
+    refusals = {machine.name: timing_refusal(machine) for machine in chosen}
+    for told in filter(None, refusals.values()):
+        remark(f"no cycles: {told}")
+    return [machine for machine in chosen if refusals[machine.name] is None]
+
+
+def estimate_s(gbuffers: Sequence[GBuffer], num_gpus: int, num_timed: int = 0) -> float:
     """Seconds on two cores, first compilation included."""
     megapixels = sum(float(g.subsurface.sum()) for g in gbuffers) / 1e6
-    return FIRST_S + megapixels * (RENDER_S + num_gpus * COUNT_S)
+    return FIRST_S + megapixels * (RENDER_S + num_gpus * COUNT_S + num_timed * TIME_S)
 
 
 def write_results(

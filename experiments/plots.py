@@ -72,7 +72,7 @@ def _style(axes: Axes) -> None:
         axes.spines[side].set_visible(False)
 
 
-def _paired_bars(
+def paired_bars(
     axes: Axes, labels: Sequence[str], values: Mapping[str, Sequence[float]], numbers: bool = False
 ) -> None:
     """One group of bars per label, one bar per method; `numbers` puts its value above each."""
@@ -112,7 +112,7 @@ def comparison_figure(frame: pd.DataFrame, quantities: dict[str, str]) -> Figure
         of_gpu = frame[frame["gpu"] == gpu].set_index(["scene", "method"])
         for axes, (column, label) in zip(row, quantities.items(), strict=True):
             heights = {m: [float(of_gpu.loc[(s, m), column]) for s in scenes] for m in methods}
-            _paired_bars(axes, scenes, heights, numbers=True)
+            paired_bars(axes, scenes, heights, numbers=True)
             axes.margins(y=0.14)
             if gpu == gpus[0]:
                 axes.set_title(label, fontsize=FONT_SIZE)
@@ -136,7 +136,7 @@ def mip_figure(frame: pd.DataFrame, label: str) -> Figure:
             m: [float(of_scene.get((m, mip), 0.0)) for mip in mips]
             for m in dict.fromkeys(frame["method"])
         }
-        _paired_bars(axes, [str(mip) for mip in mips], heights)
+        paired_bars(axes, [str(mip) for mip in mips], heights)
         axes.set_title(scene, fontsize=FONT_SIZE)
         # Each level holds a quarter of the one below: a linear axis would show mip 0 alone.
         axes.set_yscale("log")

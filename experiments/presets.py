@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from experiments.tables import Table
 
 ACTIONS = {"list": 0, "show": 1, "diff": 2}
+VALUE_WIDTH = 24
 CONFIDENCES = (
     "S read in source code or a config, M measured on silicon, P published, R recalled from a "
     "vendor's specification, D derived, ? assumed"
@@ -82,16 +83,21 @@ def list_table() -> Table:
 
 def show_table(name: str, overrides: list[str]) -> Table:
     """One row per field of a GPU: value, source, confidence."""
+    from textwrap import wrap
+
     from cachesim import presets
     from experiments.tables import Column, Table
 
+    fields = presets.describe(name, overrides)
+    # A map of 64 address bits would leave no room for the sources.
+    fields["value"] = ["\n".join(wrap(value, VALUE_WIDTH)) for value in fields["value"]]
     columns = (
         Column("field", "field"),
-        Column("value", "value"),
+        Column("value", "value", wraps=True),
         Column("confidence", "grade"),
         Column("source", "source", wraps=True),
     )
-    return Table(name, presets.describe(name, overrides), columns, (CONFIDENCES,))
+    return Table(name, fields, columns, (CONFIDENCES,))
 
 
 def diff_table(first: str, second: str) -> Table:

@@ -1,4 +1,4 @@
-"""`cachesim run`: count one trace on one GPU and print the report."""
+"""`cachesim run`: count one trace on one GPU, or time it, and print the report."""
 
 from __future__ import annotations
 
@@ -8,15 +8,24 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from experiments.options import FetchPathName, GpuName, LayoutName, Overrides, TracePath
+from traces.errors import InputError, unknown
 
 if TYPE_CHECKING:
     import pandas as pd
 
     from cachesim import Report
+    from cachesim.config import Gpu
     from experiments.tables import Table
+
+FORMATS = ("table", "gpgpusim")
+ROOFLINE_SUFFIXES = (".png", ".pdf", ".svg")
 
 JSON_HELP = "Write the report as JSON; - writes only that to stdout."
 CSV_HELP = "Write the counters per pass, texture, mip and level as CSV."
+TIMING_HELP = "Time the run as well: cycles, and where they went."
+TIMELINE_HELP = "Write a timeline for Perfetto and chrome://tracing."
+ROOFLINE_HELP = "Draw the passes under the machine's bandwidth roofs: .png, .pdf or .svg."
+FORMAT_HELP = "gpgpusim prints the counters in GPGPU-Sim's own stat lines."
 
 
 def command(
@@ -27,15 +36,31 @@ def command(
     layout: LayoutName = None,
     json: Annotated[str | None, typer.Option("--json", metavar="FILE|-", help=JSON_HELP)] = None,
     csv: Annotated[Path | None, typer.Option("--csv", metavar="FILE", help=CSV_HELP)] = None,
+    timing: Annotated[bool, typer.Option("--timing", help=TIMING_HELP)] = False,
+    timeline: Annotated[
+        Path | None, typer.Option("--timeline", metavar="FILE.json", help=TIMELINE_HELP)
+    ] = None,
+    roofline: Annotated[
+        Path | None, typer.Option("--roofline", metavar="FILE", help=ROOFLINE_HELP)
+    ] = None,
+    shown_as: Annotated[
+        str, typer.Option("--format", metavar="table|gpgpusim", help=FORMAT_HELP)
+    ] = "table",
 ) -> None:
-    """Count a trace on a GPU: demand and miss rates per level, and by pass, texture and mip."""
+    """Count a trace on a GPU: demand and miss rates per level, by pass, texture and mip; --timing
+    adds cycles.
+    """
+    from contextlib import nullcontext
     from json import dumps
+    from time import monotonic
 
     from experiments.console import progress
     from experiments.options import check_fetch_path
-    from experiments.output import output_file, write_text
+    from experiments.output import output_file, write_figure, write_text
+    from experiments.timeline import timeline_file
 
     check_fetch_path(fetch_path)
+    check_timing_options(timing, timeline, roofline, shown_as, json)
     for path in (csv, Path(json) if json and json != "-" else None):
         if path is not None:
             output_file(path)
@@ -45,24 +70,89 @@ def command(
 
     machine = presets.load(gpu, overrides)
     opened = open_trace(trace)
-    with progress("compiling the simulator") as bar:
+    title = f"{trace.name} on {machine.name}"
+    writer = timeline_file(timeline, machine.clock_hz, title) if timeline else nullcontext()
+    with progress("compiling the simulator") as bar, writer as events:
         compile_loops(lane_address=opened.is_lane_address)
-        bar.describe(f"counting on {machine.name}")
+        bar.describe(f"{'timing' if timing else 'counting'} on {machine.name}")
+        start = monotonic()
         report = simulate(
-            opened, machine, fetch_path=fetch_path, layout=layout, progress=bar.update
+            opened,
+            machine,
+            fetch_path=fetch_path,
+            layout=layout,
+            progress=bar.update,
+            **({"timing": True, "timeline": events} if timing else {}),
         )
+        host_s = monotonic() - start
     text = dumps(report.to_json(), indent=2)
     if csv is not None:
         write_text(csv, _by_frame(report).to_csv(index=False))
+    if roofline is not None and getattr(report, "timing", None) is not None:
+        from experiments.roofline import roofline_figure
+
+        write_figure(roofline, roofline_figure(report.timing, machine, title))
     if json == "-":
         print(text)
         return
     if json is not None:
         write_text(Path(json), text + "\n")
-    print_report(report)
+    if shown_as == "gpgpusim":
+        print_stat_lines(report, machine, trace.stem, host_s)
+    else:
+        print_report(report, machine)
 
 
-def print_report(report: Report) -> None:
+def check_timing_options(
+    timing: bool, timeline: Path | None, roofline: Path | None, shown_as: str, json: str | None
+) -> None:
+    """Refuse options that do not go together, and outputs that cannot be written.
+
+    Raises:
+        InputError: an option that only a timed run has, without --timing; an unknown format; two
+            formats on stdout; a file that cannot be written, or of another kind.
+    """
+    from experiments.output import output_file
+
+    if shown_as not in FORMATS:
+        raise unknown("format", shown_as, FORMATS, "--format")
+    for option, value in (
+        ("--timeline", timeline),
+        ("--roofline", roofline),
+        ("--format", shown_as if shown_as == "gpgpusim" else None),
+    ):
+        if value is not None and not timing:
+            raise InputError(f"{option} {value}: a run without --timing has none; add --timing")
+    if shown_as == "gpgpusim" and json == "-":
+        raise InputError("--format gpgpusim: --json - writes to stdout too; name a file for one")
+    if timeline is not None:
+        output_file(timeline, ".json")
+    if roofline is not None:
+        output_file(roofline, *ROOFLINE_SUFFIXES)
+
+
+def print_stat_lines(report: Report, gpu: Gpu, name: str, host_s: float) -> None:
+    """The counters in GPGPU-Sim's stat lines on stdout; what to know of them on stderr."""
+    from experiments.console import remark
+    from experiments.gpgpusim_format import stat_lines
+    from experiments.timing_tables import comparison_notes, is_gpgpusim
+
+    if getattr(report, "timing", None) is None:
+        raise ValueError("a report without timing has no stat lines")
+    print(
+        stat_lines(report.timing, gpu, fetch_path=report.fetch_path, name=name, host_s=host_s),
+        end="",
+    )
+    if not is_gpgpusim(gpu):
+        remark(
+            f"{gpu.name} describes the card, not a config of GPGPU-Sim's: these are its names, for "
+            "another machine than the one it would simulate."
+        )
+    for line in comparison_notes(gpu, report.fetch_path, report.counters["l1"].accesses):
+        remark(line)
+
+
+def print_report(report: Report, gpu: Gpu) -> None:
     """The report's tables on stdout, and the host time of each stage on stderr."""
     from experiments.console import remark
     from experiments.tables import print_table
@@ -70,8 +160,26 @@ def print_report(report: Report) -> None:
     print_table(level_table(report))
     if report.parts is not None:
         print_table(by_table(report))
+    if getattr(report, "timing", None) is not None:
+        print_timing(report, gpu)
     stages = ", ".join(f"{name} {seconds:.2f} s" for name, seconds in report.timings.items())
     remark(f"time per stage: {stages}")
+
+
+def print_timing(report: Report, gpu: Gpu) -> None:
+    """Cycles, traffic and the bottleneck of a timed report."""
+    from dataclasses import replace
+
+    from experiments import timing_tables as tables
+    from experiments.tables import print_table
+
+    if getattr(report, "timing", None) is None:
+        return
+    print_table(tables.bandwidth_table(report.timing, gpu))
+    print_table(tables.cycles_table(report.timing, gpu))
+    where = tables.where_table(report.timing, gpu)
+    told = tables.comparison_notes(gpu, report.fetch_path, report.counters["l1"].accesses)
+    print_table(replace(where, notes=(*where.notes, *told)))
 
 
 def level_table(report: Report) -> Table:

@@ -130,6 +130,8 @@ def print_table(table: Table) -> None:
             heading,
             justify="right" if _is_number(table, column) else "left",
             no_wrap=not column.wraps,
+            # A long word of wrapping text goes on in the next line; it is not cut.
+            overflow="fold" if column.wraps else "ellipsis",
         )
     num_words = next(
         (i for i, c in enumerate(table.columns) if _is_number(table, c)), len(table.columns)

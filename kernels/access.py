@@ -26,8 +26,9 @@ class Access:
 
     texture: name. subsurface_only: executed by warps with a scattering lane, for those lanes; else
         by every lane in the frame.
-    in_loop: executed once per sample; implies subsurface_only. arithmetic, num_outstanding: as in
-        `Instruction`.
+    in_loop: executed once per sample; implies subsurface_only.
+    arithmetic: as in `Instruction`. first: the same in the loop's first turn. scattering: the same
+        in warps with a scattering lane, where others execute the access too. None: no different.
     """
 
     texture: str
@@ -36,35 +37,53 @@ class Access:
     subsurface_only: bool = False
     in_loop: bool = False
     arithmetic: tuple[tuple[str, int], ...] = ()
-    num_outstanding: int = -1
+    first: tuple[tuple[str, int], ...] | None = None
+    scattering: tuple[tuple[str, int], ...] | None = None
+
+    @property
+    def other(self) -> tuple[tuple[str, int], ...] | None:
+        """The arithmetic of a second `Instruction`, where this access needs one."""
+        return self.first if self.in_loop else self.scattering
 
 
 @dataclass(frozen=True)
 class Program:
     """One pass as a list of accesses; the loop's stand together. first_instruction: index of the
-    first in the trace.
+    first in the trace. trailing_arithmetic, registers_per_thread, shared_bytes: as in `Launch`.
     """
 
     pass_name: str
     accesses: tuple[Access, ...]
     first_instruction: int = 0
+    trailing_arithmetic: tuple[tuple[str, int], ...] = ()
+    registers_per_thread: int = 0
+    shared_bytes: int = 0
 
     @property
     def _loop(self) -> list[int]:
         return [i for i, access in enumerate(self.accesses) if access.in_loop]
 
+    @property
+    def _others(self) -> dict[int, int]:
+        """The second instruction of each access that has one, counted from `first_instruction`."""
+        having = [i for i, access in enumerate(self.accesses) if access.other is not None]
+        return {i: len(self.accesses) + k for k, i in enumerate(having)}
+
     def instructions(self, textures: Sequence[str]) -> list[Instruction]:
-        """The accesses as `Instruction`s. textures: names in the trace's order."""
+        """The accesses as `Instruction`s, and then the second ones of those that have two.
+        textures: names in the trace's order.
+        """
+        pairs = [(a, a.arithmetic) for a in self.accesses]
+        pairs += [(a, a.other) for a in self.accesses if a.other is not None]
         return [
             Instruction(
                 self.pass_name,
                 textures.index(a.texture),
                 a.operation,
                 a.footprint,
-                arithmetic=a.arithmetic,
-                num_outstanding=a.num_outstanding,
+                arithmetic=arithmetic,
             )
-            for a in self.accesses
+            for a, arithmetic in pairs
         ]
 
     def row_offsets(self, states: States) -> Offsets:
@@ -102,7 +121,7 @@ class Program:
         """(num_rows,) uint16: the instruction of each row of these warps; `offsets` from
         `row_offsets`.
         """
-        loop = self._loop
+        loop, others = self._loop, self._others
         rows = np.empty(int(offsets[-1]), np.uint16)
         if loop:
             # The loop's pattern in every row, counted from each warp's first turn; the others
@@ -110,8 +129,13 @@ class Program:
             phase = ((offsets[:-1] + self._loop_start()) % len(loop)).astype(np.int64)
             turn = (np.arange(len(rows)) - np.repeat(phase, np.diff(offsets))) % len(loop)
             rows[:] = turn + (loop[0] + self.first_instruction)
-        for i, _, at in self._rows_outside_loop(states, offsets):
-            rows[at] = i + self.first_instruction
+            scatters = np.flatnonzero(states > 0)
+            for k, i in enumerate(loop):
+                at = offsets[:-1][scatters] + self._loop_start() + k
+                rows[at] = others.get(i, i) + self.first_instruction
+        for i, warps, at in self._rows_outside_loop(states, offsets):
+            other = np.where(states[warps] > 0, others.get(i, i), i)
+            rows[at] = other + self.first_instruction
         return rows
 
     def place(

@@ -23,15 +23,13 @@ def result_name(method: Method) -> str:
 
 
 def accesses(method: Method, frame: int) -> tuple[Access, ...]:
-    """The pass's accesses; arithmetic counts are assumed, from reading the kernel."""
+    """The pass's accesses."""
     return (
-        Access("profile_id", arithmetic=(("int", 12),)),
+        Access("profile_id"),
         Access("scene_colour"),
-        Access(
-            result_name(method), subsurface_only=True, arithmetic=(("int", 2),), num_outstanding=1
-        ),
+        Access(result_name(method), subsurface_only=True),
         Access("albedo", subsurface_only=True),
-        Access("output", "store", arithmetic=(("fp32", 4), ("int", 4)), num_outstanding=0),
+        Access("output", "store"),
     )
 
 

@@ -35,7 +35,9 @@ class Method:
     b_min, b_max: bounds of the adaptive count.
     kappa: damping of the paper's correction, in [0, 1].
     alpha: weight of the newest frame in the history, in [0.001, 1].
-    sigma0_sq: target variance of the tracked luminance (the paper 0.001; the engine 0.0001).
+    sigma0_sq: target variance of the tracked luminance: the paper's 0.001 for its rule, the
+        engine's 0.0001 for its own. Counts leave b_min = 8 at about the same variance with either
+        pair (0.001 and 0.0008); mixing them moves it tenfold.
     rule: "paper" is kappa Delta + E, "engine" clamps variance / sigma0_sq.
     inverse_cdf: of the radius. mip_rule: "mip0" forces level 0.
     weights: "mean" is the dissertation's Algorithm 2.

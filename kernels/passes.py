@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Protocol
 
 from kernels import combine, prefilter, sampling, setup, update
 from kernels.access import Access, Program
 from kernels.grid import Grid
-from kernels.method import Method
+from kernels.instruction_counts.assign import count_pass
+from kernels.instruction_counts.data import DEFAULT_TARGET
+from kernels.method import PLANES, Method
 
 if TYPE_CHECKING:
     from kernels.pipeline import Pipeline
@@ -44,10 +46,35 @@ class Step:
     level: int
     grid: Grid
 
-    def program(self, method: Method, frame: int, first_instruction: int = 0) -> Program:
-        """The pass's accesses in that frame."""
+    def program(
+        self,
+        method: Method,
+        frame: int,
+        first_instruction: int = 0,
+        target: str = DEFAULT_TARGET,
+    ) -> Program:
+        """The pass's accesses in that frame. target: the instruction set whose machine code is
+        counted.
+
+        Raises:
+            InputError: an unknown target.
+        """
+        list_accesses = PASSES[self.pass_name].accesses
+        recorded = iter([*list_accesses(method, frame), None])
+        following = next(recorded)
+        is_recorded = []
+        accesses = list_accesses(replace(method, planes=PLANES), frame)
+        for access in accesses:
+            is_recorded.append(access == following)
+            following = next(recorded) if access == following else following
+        counted = count_pass(self.pass_name, method, accesses, tuple(is_recorded), target)
         return Program(
-            self.pass_name, PASSES[self.pass_name].accesses(method, frame), first_instruction
+            self.pass_name,
+            counted.accesses,
+            first_instruction,
+            counted.trailing,
+            counted.registers_per_thread,
+            counted.shared_bytes,
         )
 
 

@@ -25,11 +25,9 @@ if TYPE_CHECKING:
 
 def accesses(method: Method, frame: int) -> tuple[Access, ...]:
     """The pass's accesses, the same for every method and frame."""
-    # Arithmetic counts are assumed: a texture unit filters, so the load's four products are not
-    # instructions.
     return (
-        Access("setup", footprint="bilinear", arithmetic=(("int", 10), ("fp32", 4))),
-        Access("setup", "store", arithmetic=(("int", 4),), num_outstanding=0),
+        Access("setup", footprint="bilinear"),
+        Access("setup", "store"),
     )
 
 

@@ -42,14 +42,15 @@ def lanes_per_item(device: Device, kernel: str) -> int:
 
 
 @cache
-def _source(name: str) -> str:
+def source(name: str) -> str:
+    """The text of a program, "sampling" or "other"."""
     folder = resources.files("kernels")
     return "\n".join(folder.joinpath(f"{file}.cl").read_text() for file in _FILES[name])
 
 
 def source_hash() -> str:
     """SHA-256 of the kernels' text, for the manifest of a trace."""
-    return hashlib.sha256("".join(map(_source, _FILES)).encode()).hexdigest()
+    return hashlib.sha256("".join(map(source, _FILES)).encode()).hexdigest()
 
 
 def macros(method: Method, traced: bool) -> tuple[str, ...]:
@@ -84,5 +85,5 @@ def build(device: Device, method: Method, kernel: str, traced: bool) -> cl.Progr
     width = f"-DWIDTH={lanes_per_item(device, kernel)}"
     key = (device, name, (width, *macros(method, traced)))
     if key not in _built:
-        _built[key] = device.build(_source(name), key[2])
+        _built[key] = device.build(source(name), key[2])
     return _built[key]

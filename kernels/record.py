@@ -22,6 +22,7 @@ from kernels.device import Device, open_device
 from kernels.frame import Progress, Scene, advance, check_num_frames, gbuffer_of
 from kernels.gbuffer import GBuffer
 from kernels.grid import WARPS_PER_CTA, Grid
+from kernels.instruction_counts.data import DEFAULT_TARGET, describe
 from kernels.lanes import ROW_BYTES, LaneBuffer, LanePool
 from kernels.method import Method
 from kernels.passes import Step, list_steps
@@ -31,8 +32,6 @@ from traces.errors import InputError
 from traces.trace import Chunk, Instruction, Launch, Trace
 
 CHUNK_BYTES = 32 << 20
-#: Arithmetic after the last access of a pass. Assumed.
-_TRAILING = (("int", 1),)
 
 
 def record(
@@ -45,6 +44,7 @@ def record(
     progress: Progress | None = None,
     chunk_bytes: int = CHUNK_BYTES,
     self_check: bool = True,
+    instruction_target: str = DEFAULT_TARGET,
 ) -> Trace:
     """A trace of rendering `scene`; each run of its chunks renders again, with memory that does not
     grow with the frames.
@@ -60,15 +60,17 @@ def record(
         chunk_bytes: aimed size of a chunk's lanes; a chunk holds at least one CTA.
         self_check: compare a small frame with the NumPy reference; the manifest's
             `differing_fetches` says how many differ.
+        instruction_target: the instruction set whose machine code the arithmetic between the
+            accesses is counted in, one of `instruction_counts.data.TARGETS`.
 
     Raises:
-        InputError: num_frames or traced_frames, or frames of different size.
+        InputError: num_frames, traced_frames or instruction_target, or frames of different size.
     """
     check_num_frames(num_frames)
     frames = _list_frames(traced_frames, num_frames)
     device = device or open_device()
     first = gbuffer_of(scene, 0)
-    plan = _Plan.of(method, first.width, first.height, frames)
+    plan = _Plan.of(method, first.width, first.height, frames, instruction_target)
     manifest = {
         "scene": first.name,
         "attribution": first.attribution,
@@ -79,6 +81,7 @@ def record(
         "traced_frames": list(frames),
         "seed": "hash of pixel and frame number",
         "kernel_source_sha256": program.source_hash(),
+        "instruction_counts": describe(instruction_target),
         "device": {"name": device.name, "version": device.version},
         "differing_fetches": count_differences(device, method) if self_check else None,
         "versions": _versions(),
@@ -159,7 +162,7 @@ class _Plan:
     launch_of: dict[tuple[int, int], int]
 
     @staticmethod
-    def of(method: Method, width: int, height: int, frames: tuple[int, ...]) -> _Plan:
+    def of(method: Method, width: int, height: int, frames: tuple[int, ...], target: str) -> _Plan:
         num_levels = resources.count_levels(width, height, method)
         grid = Grid(width, height, method.tile_order, method.lane_map)
         steps = list_steps(method, grid, num_levels)
@@ -173,7 +176,7 @@ class _Plan:
                     continue
                 key = (step.pass_name, frame % 2)
                 if key not in programs:
-                    programs[key] = step.program(method, frame, len(instructions))
+                    programs[key] = step.program(method, frame, len(instructions), target)
                     instructions += programs[key].instructions(resources.TEXTURE_NAMES)
                 launch_of[frame, number] = len(launches)
                 launches.append(
@@ -182,7 +185,9 @@ class _Plan:
                         step.pass_name,
                         step.grid.num_ctas,
                         WARPS_PER_CTA,
-                        trailing_arithmetic=_TRAILING,
+                        programs[key].registers_per_thread,
+                        programs[key].shared_bytes,
+                        programs[key].trailing_arithmetic,
                     )
                 )
         return _Plan(method, num_levels, frames, programs, instructions, launches, launch_of)

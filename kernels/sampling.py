@@ -83,36 +83,20 @@ class Constants:
 
 
 def accesses(method: Method, frame: int) -> tuple[Access, ...]:
-    """The pass's traced accesses; arithmetic counts are assumed, from reading the kernel."""
+    """The pass's traced accesses."""
     colour = "colour" in method.planes
     normal = "normal" in method.planes and method.normal_weights
-    planes = [
-        Access(
-            "setup",
-            in_loop=True,
-            arithmetic=(("int", 14), ("fp32", 46), ("sfu", 5)),
-            num_outstanding=0,
-        )
-    ] * colour
-    planes += [Access("normal", in_loop=True, arithmetic=(("int", 3),), num_outstanding=1)] * normal
-    planes += [Access("profile_id", in_loop=True, arithmetic=(("int", 2),), num_outstanding=2)] * (
-        "profile_id" in method.planes
-    )
-    found = [Access("setup", arithmetic=(("int", 12),))] * colour
-    found += [Access("normal", subsurface_only=True, arithmetic=(("int", 2),))] * normal
+    planes = [Access("setup", in_loop=True)] * colour
+    planes += [Access("normal", in_loop=True)] * normal
+    planes += [Access("profile_id", in_loop=True)] * ("profile_id" in method.planes)
+    found = [Access("setup")] * colour
+    found += [Access("normal", subsurface_only=True)] * normal
     if method.adaptive:
         found += [
             Access("velocity", subsurface_only=True),
-            Access(
-                history_names(frame)[0],
-                subsurface_only=True,
-                arithmetic=(("fp32", 4), ("int", 4)),
-                num_outstanding=2,
-            ),
+            Access(history_names(frame)[0], subsurface_only=True),
         ]
-    store = Access(
-        "scattered", "store", arithmetic=(("fp32", 60), ("int", 16), ("sfu", 12)), num_outstanding=0
-    )
+    store = Access("scattered", "store")
     return (*found, *planes, store)
 
 

@@ -19,13 +19,12 @@ if TYPE_CHECKING:
 
 def accesses(method: Method, frame: int) -> tuple[Access, ...]:
     """The pass's accesses, the same for every method and frame."""
-    # Arithmetic counts are assumed: from reading the kernel, not from machine code.
     return (
-        Access("gbuffer_id", arithmetic=(("int", 12),)),
-        Access("depth", num_outstanding=1),
-        Access("scene_light", subsurface_only=True, arithmetic=(("int", 3),), num_outstanding=0),
-        Access("setup", "store", arithmetic=(("fp32", 4), ("int", 6)), num_outstanding=0),
-        Access("profile_id", "store", arithmetic=(("int", 2),)),
+        Access("gbuffer_id"),
+        Access("depth"),
+        Access("scene_light", subsurface_only=True),
+        Access("setup", "store"),
+        Access("profile_id", "store"),
     )
 
 

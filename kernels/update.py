@@ -35,15 +35,15 @@ def history_names(frame: int) -> tuple[str, str]:
 
 
 def accesses(method: Method, frame: int) -> tuple[Access, ...]:
-    """The pass's accesses; arithmetic counts are assumed, from reading the kernel."""
+    """The pass's accesses."""
     old, new = history_names(frame)
     return (
-        Access("scattered", arithmetic=(("int", 12),)),
+        Access("scattered"),
         Access("velocity", subsurface_only=True),
         Access("depth", subsurface_only=True),
-        Access(old, subsurface_only=True, arithmetic=(("fp32", 4), ("int", 4)), num_outstanding=1),
-        Access("resolved", "store", arithmetic=(("fp32", 24), ("sfu", 6)), num_outstanding=0),
-        Access(new, "store", arithmetic=(("int", 4),)),
+        Access(old, subsurface_only=True),
+        Access("resolved", "store"),
+        Access(new, "store"),
     )
 
 

@@ -5,44 +5,28 @@ loads skip the L1.
 from __future__ import annotations
 
 import functools
-import importlib.util
 from pathlib import Path
-from types import ModuleType
+from typing import Any
 
 import pandas as pd
 import pytest
 
 from cachesim import presets, simulate
-from traces.lane_address import lane_address_trace
+from traces.oracle_traces import oracle_trace
 from traces.trace import Trace
 
-ORACLE = Path(__file__).resolve().parents[2] / "shared" / "oracles" / "accel-sim"
-pytestmark = pytest.mark.skipif(
-    not (ORACLE / "results.csv").exists(),
-    reason="Accel-Sim's results are not beside the repository (../shared/oracles/accel-sim)",
-)
+RESULTS = Path(__file__).parent / "oracles" / "accel-sim" / "results.csv"
 #: Small ones: no reuse, one warp, one line for all, scattered reads with stores, wide scatter.
 NAMES = ("stream", "chase", "latency_l1", "l1_throughput", "blur16_store", "far200_morton")
 
 
 @functools.cache
-def generator() -> ModuleType:
-    """The oracle's own program that makes the traces."""
-    spec = importlib.util.spec_from_file_location("accel_sim_traces", ORACLE / "traces.py")
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-@functools.cache
 def trace_of(name: str) -> Trace:
-    fields = dict(generator().TRACES[name]())
-    return lane_address_trace(fields.pop("addresses"), **fields, name=name)
+    return oracle_trace(name)
 
 
-def result(config: str, name: str) -> pd.Series:
-    table = pd.read_csv(ORACLE / "results.csv")
+def result(config: str, name: str) -> dict[str, Any]:
+    table = pd.read_csv(RESULTS)
     (row,) = table[(table["config"] == config) & (table["trace"] == name)].to_dict("records")
     return row
 

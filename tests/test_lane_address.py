@@ -16,7 +16,7 @@ from traces.open import open_trace
 from traces.parquet import write_parquet
 from traces.synthetic import stream
 from traces.texture import INACTIVE_ADDRESS
-from traces.trace import Trace
+from traces.trace import WAIT, Trace
 
 SCALARS = {"warps_per_cta": 2, "loads_in_flight": 4, "compute_per_load": 3, "bytes_per_lane": 8}
 
@@ -29,42 +29,48 @@ def some_addresses(warps: int = 4, loads: int = 6) -> np.ndarray:
 
 
 def warp_programs(trace: Trace) -> list[list[str]]:
-    """What each warp issues, in order: "int", "fp32", "load", "store", "wait" (for all earlier
-    accesses).
+    """What each warp issues, in order: "int", "fp32", "load", "store", and "back n" where it waits
+    until its first n loads are back.
     """
     programs = []
     for chunk in trace.chunks():
         for begin, end in zip(chunk.warp_offsets, chunk.warp_offsets[1:], strict=False):
-            issued = []
+            issued: list[str] = []
             for index in chunk.instruction[begin:end]:
                 instruction = trace.instructions[index]
-                if instruction.num_outstanding == 0:
-                    issued.append("wait")
-                for kind, count in instruction.arithmetic:
-                    issued += [kind] * count
+                issue(issued, instruction.arithmetic)
+                if instruction.num_outstanding >= 0:
+                    issue(issued, ((WAIT, instruction.num_outstanding),))
                 issued.append(instruction.operation)
-            for kind, count in trace.launches[0].trailing_arithmetic:
-                issued += [kind] * count
+            issue(issued, trace.launches[0].trailing_arithmetic)
             programs.append(issued)
     return programs
+
+
+def issue(issued: list[str], arithmetic: tuple[tuple[str, int], ...]) -> None:
+    for kind, count in arithmetic:
+        if kind == WAIT:
+            issued.append(f"back {issued.count('load') - count}")
+        else:
+            issued += [kind] * count
 
 
 @given(
     stores=st.lists(st.booleans(), max_size=12),
     loads_in_flight=st.integers(1, 5),
-    compute_per_load=st.integers(0, 3),
+    compute_per_load=st.integers(1, 3),
 )
 def test_a_warp_issues_what_the_format_describes(
     stores: list[bool], loads_in_flight: int, compute_per_load: int
 ) -> None:
-    expected, pending = ["int"], []
+    expected, num_loads = ["int"], 0
     for begin in range(0, len(stores), loads_in_flight):
         group = stores[begin : begin + loads_in_flight]
-        # FMAs use the loads' results, so the accesses after them find nothing in flight.
-        expected += ["wait", *pending] if pending else []
         expected += ["store" if store else "load" for store in group]
-        pending = ["fp32"] * (compute_per_load * group.count(False))
-    expected += pending
+        for _ in range(group.count(False)):
+            # Each load's FMAs use that load's result.
+            num_loads += 1
+            expected += [f"back {num_loads}"] + ["fp32"] * compute_per_load
     trace = lane_address_trace(
         some_addresses(4, len(stores)),
         **SCALARS | {"loads_in_flight": loads_in_flight, "compute_per_load": compute_per_load},
@@ -72,6 +78,25 @@ def test_a_warp_issues_what_the_format_describes(
     )
     assert warp_programs(trace) == [expected] * 4
     check(trace)
+
+
+def test_without_fmas_a_load_waits_for_its_register() -> None:
+    """At place p of its group it takes the register of the load at place p of the group before."""
+    scalars = SCALARS | {"loads_in_flight": 3, "compute_per_load": 0}
+    (program, *_) = warp_programs(lane_address_trace(some_addresses(4, 8), **scalars))
+    later = [word for k in range(1, 6) for word in (f"back {k}", "load")]
+    assert program == ["int", "load", "load", "load", *later]
+    stores = np.arange(8) % 4 == 1
+    scalars |= {"loads_in_flight": 4}
+    (program, *_) = warp_programs(
+        lane_address_trace(some_addresses(4, 8), **scalars, stores=stores)
+    )
+    first = ["int", "load", "store", "load", "load"]
+    assert program == [*first, "back 1", "load", "store", "back 2", "load", "back 3", "load"]
+
+
+def test_a_thread_has_32_registers() -> None:
+    assert lane_address_trace(some_addresses(), **SCALARS).launches[0].registers_per_thread == 32
 
 
 def test_addresses_come_back_in_warp_order_with_inactive_lanes_marked(tmp_path: Path) -> None:
@@ -210,7 +235,7 @@ def test_files_of_no_known_format_are_bad_input(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="cannot be read"):
         open_trace(tmp_path)
     np.save(tmp_path / "array.npy", some_addresses())
-    with pytest.raises(InputError, match="is neither a Parquet trace nor a lane-address"):
+    with pytest.raises(InputError, match="is no Parquet trace, lane-address"):
         open_trace(tmp_path / "array.npy")
     with pytest.raises(InputError, match=r"is not an \.npz archive"):
         read_lane_address(tmp_path / "array.npy")

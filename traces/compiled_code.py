@@ -17,11 +17,12 @@ _PACKAGES = ("traces", "cachesim", "kernels")
 
 
 def source_hash(root: Path) -> str:
-    """16 hex digits over the names and contents of the packages' Python files."""
+    """16 hex digits over the names and contents of the packages' Python files, nested ones too."""
     digest = hashlib.sha256()
     for package in _PACKAGES:
-        for path in sorted((root / package).glob("*.py")):
-            digest.update(f"{package}/{path.name}\0".encode() + path.read_bytes())
+        for path in sorted((root / package).rglob("*.py")):
+            name = path.relative_to(root).as_posix()
+            digest.update(f"{name}\0".encode() + path.read_bytes())
     return digest.hexdigest()[:16]
 
 

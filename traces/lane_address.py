@@ -5,7 +5,7 @@ The file holds `addresses` (warps, loads, 32) uint64, 0 = inactive lane; the int
 `warps_per_cta`, `loads_in_flight`, `compute_per_load`, `bytes_per_lane`; and, where some accesses
 are stores, `stores` (loads,) bool. Warp w is of CTA w // warps_per_cta. A warp runs one integer
 instruction, then groups of `loads_in_flight` accesses issued back to back, each group followed by
-`compute_per_load` FMAs per load of it, which use the loads' results; then it exits.
+`compute_per_load` FMAs per load of it, in load order, which use that load's result; then it exits.
 """
 
 from __future__ import annotations
@@ -23,12 +23,15 @@ from traces.check import ACCESS_BYTES, MAX_INSTRUCTIONS, MAX_WARPS_PER_CTA
 from traces.errors import InputError
 from traces.files import replacing, writing
 from traces.texture import INACTIVE_ADDRESS, WARP_SIZE
-from traces.trace import Chunk, Instruction, Launch, Trace
+from traces.trace import WAIT, Chunk, Instruction, Launch, Trace
 
 PASS_NAME = "import"
+REGISTERS_PER_THREAD = 32
 _SCALARS = ("warps_per_cta", "loads_in_flight", "compute_per_load", "bytes_per_lane")
 _ROWS_PER_CHUNK = 1 << 16
 _MAX_COUNT = (1 << 31) - 1
+
+Arithmetic = tuple[tuple[str, int], ...]
 
 
 def read_lane_address(path: str | Path) -> Trace:
@@ -108,10 +111,11 @@ def lane_address_trace(
         bytes_per_lane: 1, 2, 4, 8 or 16.
     stores: (loads,) bool, the accesses that are stores. name: what messages call the trace.
 
-    The first access of a group that follows FMAs carries them as `arithmetic` and must wait for all
-    earlier accesses (`num_outstanding` 0), as the FMAs use the results; the others may issue with
-    any number outstanding, which within a group is at most their place in it. The FMAs of the last
-    group are the launch's `trailing_arithmetic`.
+    The FMAs of a group stand in the `arithmetic` of the access after it, those of the last group in
+    the launch's `trailing_arithmetic`: per load a wait until only those behind it in the group may
+    be in flight, and a run of `compute_per_load`. Without FMAs a load's result is waited for by the
+    load that takes its register, the one at its place in the next group: its `num_outstanding` then
+    keeps to `loads_in_flight`. A thread has 32 registers.
 
     Raises:
         InputError: a wrong shape, type or value.
@@ -134,7 +138,14 @@ def lane_address_trace(
             f"allowed are up to {MAX_INSTRUCTIONS}"
         )
     index = program.astype(np.uint16)
-    launch = Launch(0, PASS_NAME, num_ctas, warps_per_cta, trailing_arithmetic=trailing)
+    launch = Launch(
+        0,
+        PASS_NAME,
+        num_ctas,
+        warps_per_cta,
+        registers_per_thread=REGISTERS_PER_THREAD,
+        trailing_arithmetic=trailing,
+    )
     ctas_per_chunk = max(1, _ROWS_PER_CHUNK // max(1, warps_per_cta * num_loads))
 
     def chunks() -> Iterator[Chunk]:
@@ -157,29 +168,48 @@ def lane_address_trace(
 
 def _program(
     stores: npt.NDArray[np.bool_], loads_in_flight: int, compute_per_load: int, bytes_per_lane: int
-) -> tuple[list[Instruction], npt.NDArray[np.int64], tuple[tuple[str, int], ...]]:
+) -> tuple[list[Instruction], npt.NDArray[np.int64], Arithmetic]:
     """The different instructions, the one of each of the warp's accesses, and the arithmetic after
     the last.
     """
     known: dict[Instruction, int] = {}
     program = np.zeros(len(stores), np.int64)
-    arithmetic: tuple[tuple[str, int], ...] = (("int", 1),)
+    arithmetic: Arithmetic = (("int", 1),)
+    # The load that last took the register of each place among a group's loads, and how many loads
+    # are known to be back.
+    owner: dict[int, int] = {}
+    num_loads = num_done = 0
     for begin in range(0, len(stores), loads_in_flight):
         group = stores[begin : begin + loads_in_flight]
+        place = 0
         for slot, store in enumerate(group, begin):
-            before = arithmetic if slot == begin else ()
+            num_outstanding = -1
+            if not store:
+                if not compute_per_load and owner.get(place, -1) >= num_done:
+                    num_done = owner[place] + 1
+                    num_outstanding = num_loads - num_done
+                owner[place] = num_loads
+                num_loads, place = num_loads + 1, place + 1
             instruction = Instruction(
                 PASS_NAME,
                 -1,
                 "store" if store else "load",
                 access_bytes=bytes_per_lane,
-                arithmetic=before,
-                num_outstanding=0 if before and begin else -1,
+                arithmetic=arithmetic,
+                num_outstanding=num_outstanding,
             )
             program[slot] = known.setdefault(instruction, len(known))
-        num_fmas = compute_per_load * int(np.count_nonzero(~group))
-        arithmetic = (("fp32", num_fmas),) if num_fmas else ()
+            arithmetic = ()
+        arithmetic = _uses(place, compute_per_load)
     return list(known), program, arithmetic
+
+
+def _uses(num_loads: int, compute_per_load: int) -> Arithmetic:
+    """What follows a group of accesses: per load of it, in order, the FMAs that need it."""
+    if not compute_per_load:
+        return ()
+    runs = (((WAIT, num_loads - 1 - k), ("fp32", compute_per_load)) for k in range(num_loads))
+    return tuple(item for run in runs for item in run)
 
 
 def _check(

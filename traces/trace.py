@@ -19,6 +19,10 @@ from traces.texture import INACTIVE_ADDRESS, INACTIVE_TEXEL, WARP_SIZE, Texture
 
 OPERATIONS = ("load", "store", "atomic")
 FOOTPRINTS = ("point", "bilinear")
+#: Units that arithmetic runs on; "control" are branches, barriers and the like.
+ARITHMETIC_KINDS = ("int", "fp32", "sfu", "control")
+#: The kind in `Instruction.arithmetic` that issues nothing, see there.
+WAIT = "wait"
 
 
 @dataclass(frozen=True)
@@ -31,10 +35,12 @@ class Instruction:
         the top-left texel of the 2x2 footprint, whose other texels are clamped to the level's edge.
     access_bytes: bytes each lane moves at its address; the texel's size unless this is a
         lane-address trace.
-    arithmetic: warp instructions issued since the previous access, as (kind, count) pairs; kinds
-        are "int", "fp32", "sfu", ...
-    num_outstanding: how many of the warp's earlier accesses may still be in flight when this one
-        issues; -1 = any number.
+    arithmetic: what the warp issues after its previous access, in order, as (kind, count) pairs:
+        count warp instructions of one of `ARITHMETIC_KINDS`, in a run of three dependent chains
+        (number c of the run needs the result of number c - 3); or ("wait", n), which issues nothing
+        and holds the warp until all its loads but the n latest have their data.
+    num_outstanding: such a wait directly before the access; -1 = none. Waits count loads, and
+        atomics as they return data too; stores are never waited for.
     """
 
     pass_name: str
@@ -147,8 +153,10 @@ def warp_of_rows(chunk: Chunk) -> npt.NDArray[np.int64]:
 
 
 __all__ = [
+    "ARITHMETIC_KINDS",
     "FOOTPRINTS",
     "OPERATIONS",
+    "WAIT",
     "WARP_SIZE",
     "Chunk",
     "Instruction",
