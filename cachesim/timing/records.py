@@ -174,6 +174,7 @@ SM = np.dtype(
         ("issued_slot", "i4", (5, MAX_SCHEDULERS)),
         ("issued_order", "i8", (5, MAX_SCHEDULERS)),
         ("issued_chain", "i4", (5, MAX_SCHEDULERS)),
+        ("issued_kind", "i4", (5, MAX_SCHEDULERS)),
         ("issued_row", "i8", (MAX_SCHEDULERS,)),
         ("issued_load", "i4", (MAX_SCHEDULERS,)),
         ("collector_slot", "i4", (MAX_SCHEDULERS, MAX_COLLECTORS)),
@@ -248,6 +249,7 @@ WARP = np.dtype(
         ("alive", "i4"),
         ("age", "i8"),
         ("int_ready", "i8"),
+        ("exit_ready", "i8"),  # when its exit has left the pipeline
         ("chains_ready", "i8", (3,)),
         ("pending", "i4", (MAX_LOADS,)),
     ],

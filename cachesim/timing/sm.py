@@ -8,6 +8,7 @@ from cachesim.compiled import compiled
 from cachesim.stream import STORE
 from cachesim.timing.pipe import step_pipe
 from cachesim.timing.records import (
+    CONTROL,
     FP32,
     INT,
     MAX_LOADS,
@@ -21,7 +22,7 @@ from cachesim.timing.records import (
     R_MEMORY,
     WHEEL,
 )
-from cachesim.timing.warp import advance, schedule, start_warp, wake_timed
+from cachesim.timing.warp import advance, is_exit, schedule, start_warp, wake_timed
 
 U64 = np.uint64
 #: An instruction may issue this many cycles before its unit is free: it is collected meanwhile.
@@ -57,6 +58,9 @@ def _pick(state, index, scheduler, candidates):  # type: ignore[no-untyped-def]
 
 @compiled
 def _unit_of(machine, kind):  # type: ignore[no-untyped-def]
+    """The unit that executes a kind; GPGPU-Sim's control instructions take the fp32 one."""
+    if kind == CONTROL and machine.collector_units > 0:
+        kind = INT
     return FP32 if kind == INT and machine.int_on_fp32 else kind
 
 
@@ -79,14 +83,19 @@ def _dispatch(state, index, s, c):  # type: ignore[no-untyped-def]
         sm.queue_load[s, 0] = sm.collector_load[s, c]
     else:
         unit = _unit_of(machine, kind)
-        if sm.unit_free[s, unit] > now + 1:
+        # One instruction may wait between collector and unit.
+        if sm.unit_free[s, unit] - state.latencies[kind, 1] > now:
             return False
-        start = max(now + 1, sm.unit_free[s, unit])
-        sm.unit_free[s, unit] = start + state.latencies[kind, 1]
-        done = start + state.latencies[kind, 0] + machine.result_cycles - _AHEAD
         slot = sm.collector_slot[s, c]
         warp = state.warps[index * MAX_WARPS + slot]
-        warp.chains_ready[sm.collector_chain[s, c]] = done
+        is_last = sm.collector_chain[s, c] < 0
+        start = max(now + 1, sm.unit_free[s, unit])
+        sm.unit_free[s, unit] = start + (1 if is_last else state.latencies[kind, 1])
+        done = start + state.latencies[kind, 0] + machine.result_cycles - _AHEAD
+        if is_last:
+            warp.exit_ready = start + machine.result_cycles - _AHEAD + 1
+        else:
+            warp.chains_ready[sm.collector_chain[s, c]] = done
         if kind == INT:
             warp.int_ready = done
         if warp.waits_chain >= 0:
@@ -110,10 +119,10 @@ def _collect(state, index):  # type: ignore[no-untyped-def]
         for s in range(machine.num_schedulers):
             for c in range(machine.collector_units):
                 if sm.collector_slot[s, c] >= 0:
-                    if sm.collector_ready[s, c]:
+                    if sm.collector_ready[s, c] > 0:
                         _dispatch(state, index, s, c)
                     else:
-                        sm.collector_ready[s, c] = 1
+                        sm.collector_ready[s, c] += 1
         for kind in range(5):
             while True:
                 oldest, order = -1, NEVER
@@ -130,8 +139,10 @@ def _collect(state, index):  # type: ignore[no-untyped-def]
                 if free < 0:
                     break
                 sm.collector_slot[oldest, free] = sm.issued_slot[kind, oldest]
-                sm.collector_kind[oldest, free] = kind
-                sm.collector_ready[oldest, free] = 0
+                sm.collector_kind[oldest, free] = sm.issued_kind[kind, oldest]
+                # One operand is read a step; a memory instruction needs its address alone.
+                exits = sm.issued_chain[kind, oldest] < 0
+                sm.collector_ready[oldest, free] = 1 if exits else 0 if kind == MEMORY else -1
                 sm.collector_order[oldest, free] = order
                 sm.collector_chain[oldest, free] = sm.issued_chain[kind, oldest]
                 if kind == MEMORY:
@@ -151,6 +162,7 @@ def _enter_collectors(state, index, s, slot, warp, kind):  # type: ignore[no-unt
     sm.issued_slot[place, s] = slot
     sm.issued_order[place, s] = sm.order
     sm.issued_chain[place, s] = warp.chain
+    sm.issued_kind[place, s] = kind
     if kind == MEMORY:
         row = state.work.rows[warp.row & machine.row_mask]
         sm.issued_row[s] = warp.row
@@ -158,6 +170,9 @@ def _enter_collectors(state, index, s, slot, warp, kind):  # type: ignore[no-unt
             sm.issued_load[s] = warp.next_load
             warp.pending[warp.next_load & (MAX_LOADS - 1)] = max(1, row.sectors)
             warp.next_load += 1
+    elif is_exit(warp):
+        sm.issued_chain[place, s] = -1
+        warp.exit_ready = NEVER
     else:
         warp.chains_ready[warp.chain] = NEVER
         if kind == INT:
@@ -173,6 +188,9 @@ def _start_arithmetic(state, index, scheduler, warp, kind, now):  # type: ignore
     start = max(now + _AHEAD, sm.unit_free[scheduler, unit])
     sm.unit_free[scheduler, unit] = start + state.latencies[kind, 1]
     done = start + state.latencies[kind, 0] + machine.result_cycles - _AHEAD
+    if is_exit(warp):
+        warp.exit_ready = start + machine.result_cycles - _AHEAD + 1
+        return
     warp.chains_ready[warp.chain] = done
     if kind == INT:
         warp.int_ready = done

@@ -41,6 +41,18 @@ def _finish(state, index, slot):  # type: ignore[no-untyped-def]
 
 
 @compiled
+def is_exit(warp):  # type: ignore[no-untyped-def]
+    """Whether the warp's next instruction is its exit, which depends on nothing."""
+    return warp.in_trailer and warp.operation == warp.last_operation - 1
+
+
+@compiled
+def has_exited(warp):  # type: ignore[no-untyped-def]
+    """Whether the warp has issued all its instructions."""
+    return warp.in_trailer and warp.operation >= warp.last_operation
+
+
+@compiled
 def schedule(state, index, slot, earliest):  # type: ignore[no-untyped-def]
     """Find what a warp issues next, and put it where the issue logic sees it no sooner than cycle
     `earliest`: on a ready mask, on the wheel, or blocked until loads are back.
@@ -69,14 +81,21 @@ def schedule(state, index, slot, earliest):  # type: ignore[no-untyped-def]
                 warp.left = -1
                 continue
             kind = step.kind
-            ready = max(ready, warp.chains_ready[warp.chain])
+            if not is_exit(warp):
+                ready = max(ready, warp.chains_ready[warp.chain])
             break
         if warp.in_trailer:
             if warp.oldest_load < warp.next_load or warp.stores > 0:
                 _block(sm, warp, warp.next_load)
                 return
-            _finish(state, index, slot)
-            return
+            # A warp leaves when its last instructions have left the pipeline.
+            ready = warp.exit_ready
+            for chain in range(3):
+                ready = max(ready, warp.chains_ready[chain])
+            if ready <= machine.now:
+                _finish(state, index, slot)
+                return
+            break
         row = work.rows[warp.row & machine.row_mask]
         instruction = work.instructions[row.code]
         until = warp.next_load - (MAX_LOADS - 2)
@@ -119,7 +138,10 @@ def wake_timed(state, index):  # type: ignore[no-untyped-def]
             kind = MEMORY
             if warp.operation < warp.last_operation:
                 kind = state.work.operations[warp.operation].kind
-            sm.ready[kind] |= np.uint64(1) << np.uint64(slot)
+            if has_exited(warp):
+                schedule(state, index, slot, machine.now)
+            else:
+                sm.ready[kind] |= np.uint64(1) << np.uint64(slot)
         due >>= np.uint64(1)
         slot += 1
 
@@ -129,7 +151,7 @@ def _unblock(state, warp_index):  # type: ignore[no-untyped-def]
     warp = state.warps[warp_index]
     if warp.waits_for < 0 or warp.oldest_load < warp.waits_for:
         return
-    if warp.in_trailer and warp.operation >= warp.last_operation and warp.stores > 0:
+    if has_exited(warp) and warp.stores > 0:
         return
     warp.waits_for = -1
     index = warp_index // MAX_WARPS
@@ -190,7 +212,7 @@ def advance(state, index, slot, now, again):  # type: ignore[no-untyped-def]
 
 @compiled
 def start_warp(state, index, slot, place, first, rows, age):  # type: ignore[no-untyped-def]
-    """Put a warp into a slot of an SM; it may issue in the next cycle."""
+    """Put a warp into a slot of an SM; it may issue once its instructions are fetched, two cycles later."""
     machine = state.pool.machine[0]
     sm = state.sms[index]
     work = state.work
@@ -209,6 +231,7 @@ def start_warp(state, index, slot, place, first, rows, age):  # type: ignore[no-
     warp.alive = 1
     warp.age = age
     warp.int_ready = 0
+    warp.exit_ready = 0
     for chain in range(3):
         warp.chains_ready[chain] = 0
     if rows > 0:
@@ -223,4 +246,4 @@ def start_warp(state, index, slot, place, first, rows, age):  # type: ignore[no-
     state.resident[0] += sm.num_resident * (machine.now - sm.resident_since)
     sm.resident_since = machine.now
     sm.num_resident += 1
-    schedule(state, index, slot, machine.now + 1 + machine.cta_launch_cycles)
+    schedule(state, index, slot, machine.now + 2 + machine.cta_launch_cycles)
