@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
+import numpy.typing as npt
 
 # Columns of the counters: all in the level's sectors, except REQUESTS.
 (
@@ -18,8 +21,9 @@ import numpy as np
     BYPASSES,
     BYPASSED_WRITES,
     WRITEBACKS,
-) = range(12)
-NUM_COUNTERS = 12
+    MERGED,
+) = range(13)
+NUM_COUNTERS = 13
 
 # What a store does on a present sector, and on an absent one (facts sheet 3.2, `wr` and `wralloc`).
 HIT_THROUGH, HIT_BACK, HIT_EVICT = range(3)
@@ -32,3 +36,16 @@ USED, VALID, PARTIAL, DIRTY = np.uint64(0), np.uint64(1), np.uint64(2), np.uint6
 VALID_SHIFT, PARTIAL_SHIFT, DIRTY_SHIFT = np.uint64(8), np.uint64(16), np.uint64(24)
 
 POPCOUNT = np.array([bin(m).count("1") for m in range(256)], np.int64)
+
+
+class CountedLevel(NamedTuple):
+    """A level's counters at the end of a run. counters: (groups, NUM_COUNTERS) int64; dirty:
+    (groups,) int64 dirty sectors still held, by the group that dirtied them. num_distinct: sectors
+    asked for at least once, None where not counted.
+    """
+
+    name: str
+    sector_bytes: int
+    counters: npt.NDArray[np.int64]
+    dirty: npt.NDArray[np.int64]
+    num_distinct: int | None

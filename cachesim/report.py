@@ -14,6 +14,8 @@ from typing import Any
 
 import pandas as pd
 
+from cachesim.timing.results import TimingResult
+
 
 class ConservationError(AssertionError):
     """A law of the report does not hold: a defect of the simulator, never of its input."""
@@ -139,8 +141,8 @@ class Report:
         parts: None for a trace without
     provenance. num_rows: warp instructions issued. distinct_sectors: of the sliced levels, which
         are never emptied, how many different sectors were asked (compulsory misses); levels where
-        it was not counted, or that something went around, are absent. cycles, time_ms: None without
-        timing. timings: host seconds per stage.
+        it was not counted, or that something went around, are absent. timing: cycles and where they
+        went; None for a counting run. timings: host seconds per stage.
     """
 
     gpu: str
@@ -153,13 +155,29 @@ class Report:
     dram: DramCounters
     parts: tuple[Part, ...] | None
     distinct_sectors: dict[str, int] = field(default_factory=dict)
-    cycles: dict[str, int] | None = None
-    time_ms: float | None = None
+    timing: TimingResult | None = None
     timings: dict[str, float] = field(default_factory=dict, compare=False)
 
     @property
     def levels(self) -> tuple[str, ...]:
         return tuple(self.counters)
+
+    @property
+    def cycles(self) -> dict[str, Any] | None:
+        """The contract's "cycles": total, launch, where they went, and the same per pass."""
+        return self.timing.to_json() if self.timing else None
+
+    @property
+    def time_ms(self) -> float | None:
+        """Milliseconds at the preset's clock."""
+        return self.timing.time_ms if self.timing else None
+
+    @property
+    def gpgpusim(self) -> dict[str, dict[str, int]] | None:
+        """GPGPU-Sim's own counters, by level."""
+        if self.timing is None:
+            return None
+        return {level: dict(counters) for level, counters in self.timing.gpgpusim.items()}
 
     @property
     def demand(self) -> dict[str, int]:
@@ -265,6 +283,7 @@ class Report:
             "warp_instructions": self.num_rows,
             "cycles": self.cycles,
             "time_ms": self.time_ms,
+            **({"gpgpusim": self.gpgpusim} if self.timing else {}),
             "by": by,
         }
 

@@ -1,6 +1,7 @@
 """Simulate: a trace and a GPU in, a `Report` out.
 
 trace ──► place texels ──► dispatch ──► coalesce ──► L1 ──► L2 ──► DRAM ──► report
+                └──► with timing: the same machine with a clock (`cachesim.timing`) ──►┘
 """
 
 from __future__ import annotations
@@ -8,11 +9,12 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 
-from cachesim import cache, presets
+from cachesim import counts, presets
 from cachesim.config import Gpu
-from cachesim.level import Level
+from cachesim.counts import CountedLevel
 from cachesim.report import DramCounters, LevelCounters, Part, Report
 from cachesim.stages import Stages
+from cachesim.timing.clock import Clock, Timeline
 from traces.texture import MAX_MIPS
 from traces.trace import Trace
 
@@ -34,17 +36,22 @@ def simulate(
     layouts: Mapping[str, str] | None = None,
     threaded: bool = True,
     progress: Progress | None = None,
+    timing: bool = False,
+    timeline: Timeline | None = None,
 ) -> Report:
-    """Count what a trace asks of a GPU's caches and memory.
+    """Count what a trace asks of a GPU's caches and memory, and with `timing` how long it takes.
 
     Args: trace: recorded, read from a file, imported or synthetic. gpu: a configuration or the name
         of a preset. fetch_path: "texture", "readonly" or "global"; None takes "texture", or for a
         lane-address trace the GPU's own default. layout: texel layout; None takes the GPU's.
         layouts: other layouts for single textures, by name. threaded: run the stages side by side;
         the result is the same. progress: called with the number of lane fetches counted so far.
+        timing: run the machine cycle by cycle; the accesses are the same, what hits is not.
+        timeline: told each launch and what went on in it (with `timing`).
 
     Raises:
-        InputError: unknown GPU, fetch path or layout, or a trace that does not fit.
+        InputError: unknown GPU, fetch path or layout, a trace that does not fit, or a GPU without
+            the timing tables.
         ConservationError: a law of the report is broken.
     """
     return simulate_all(
@@ -55,6 +62,8 @@ def simulate(
         layouts=layouts,
         threaded=threaded,
         progress=progress,
+        timing=timing,
+        timeline=timeline,
     )[0]
 
 
@@ -67,23 +76,31 @@ def simulate_all(
     layouts: Mapping[str, str] | None = None,
     threaded: bool = True,
     progress: Progress | None = None,
+    timing: bool | Sequence[bool] = False,
+    timeline: Timeline | None = None,
 ) -> list[Report]:
     """`simulate` for several GPUs in one pass over the trace's chunks, so that a live recording
-    renders once.
+    renders once. timing: for all, or one value per GPU. timeline: of the first timed GPU.
     """
     chosen = [presets.load(g) if isinstance(g, str) else g for g in gpus]
+    timed = [timing] * len(chosen) if isinstance(timing, bool) else list(timing)
     alone = len(chosen) == 1
-    models = [
-        Stages(trace, gpu, fetch_path, layout, layouts, threaded=threaded and alone)
-        for gpu in chosen
-    ]
+    models: list[Stages | Clock] = []
+    for gpu, with_clock in zip(chosen, timed, strict=True):
+        if with_clock:
+            shown, timeline = timeline, None
+            models.append(Clock(trace, gpu, fetch_path, layout, layouts, timeline=shown))
+        else:
+            models.append(
+                Stages(trace, gpu, fetch_path, layout, layouts, threaded=threaded and alone)
+            )
     try:
         with ThreadPoolExecutor(len(models) if threaded and not alone else 1) as pool:
             for chunk in trace.chunks():
                 list(pool.map(lambda m, c=chunk: m.add(c), models))
                 if progress is not None:
                     progress(models[0].num_lane_fetches)
-            list(pool.map(Stages.finish, models))
+            list(pool.map(lambda m: m.finish(), models))
             reports = [_report(trace, g, m) for g, m in zip(chosen, models, strict=True)]
             if progress is not None:
                 progress(reports[0].lane_fetches)
@@ -93,69 +110,65 @@ def simulate_all(
             model.close()
 
 
-def _report(trace: Trace, gpu: Gpu, stages: Stages) -> Report:
-    """The checked report of finished stages."""
-    hierarchy = stages.hierarchy
-    levels = hierarchy.levels
-    dirty = [level.dirty_by_group(len(hierarchy.lane_fetches)) for level in levels]
+def _report(trace: Trace, gpu: Gpu, model: Stages | Clock) -> Report:
+    """The checked report of a finished model."""
+    levels = model.counted_levels()
     parts = []
-    for pair, (pass_name, texture) in enumerate(stages.pairs):
+    for pair, (pass_name, texture) in enumerate(model.pairs):
         if texture < 0:
             continue
         for mip in range(trace.textures[texture].num_mips):
             group = pair * MAX_MIPS + mip
-            counters = {
-                level.name: _counters(level, slice(group, group + 1), int(dirty[k][group]))
-                for k, level in enumerate(levels)
-            }
-            fetches = int(hierarchy.lane_fetches[group])
+            counters = {level.name: _counters(level, slice(group, group + 1)) for level in levels}
+            fetches = int(model.lane_fetches[group])
             name = trace.textures[texture].name
             part = Part(pass_name, name, mip, fetches, counters, _dram(gpu, counters))
             if fetches or any(c.presented or c.writebacks for c in counters.values()):
                 parts.append(part)
-    counters = {
-        level.name: _counters(level, slice(None), int(dirty[k].sum()))
-        for k, level in enumerate(levels)
-    }
+    counters = {level.name: _counters(level, slice(None)) for level in levels}
     manifest = trace.manifest
     report = Report(
         gpu=gpu.name,
         trace={k: manifest[k] for k in _IDENTIFYING if k in manifest},
-        fetch_path=stages.fetch_path,
-        layout=stages.layout,
-        num_rows=hierarchy.num_rows,
-        lane_fetches=int(hierarchy.lane_fetches.sum()),
+        fetch_path=model.fetch_path,
+        layout=model.layout,
+        num_rows=model.num_rows,
+        lane_fetches=model.num_lane_fetches,
         counters=counters,
         dram=_dram(gpu, counters),
         parts=None if trace.is_lane_address else tuple(parts),
         distinct_sectors={
             level.name: level.num_distinct
             for level in levels
-            if level.num_distinct is not None and not level.counters[:, cache.BYPASSES].any()
+            if level.num_distinct is not None and not level.counters[:, counts.BYPASSES].any()
         },
-        timings=dict(hierarchy.timings),
+        timing=model.timing_result() if isinstance(model, Clock) else None,
+        timings=model.timings,
     )
     report.check()
+    if isinstance(model, Clock):
+        model.check(report.dram)
     return report
 
 
-def _counters(level: Level, groups: slice, dirty_at_end: int) -> LevelCounters:
+def _counters(level: CountedLevel, groups: slice) -> LevelCounters:
     row = level.counters[groups].sum(axis=0)
     return LevelCounters(
-        sector_bytes=level.config.sector_bytes,
-        requests=int(row[cache.REQUESTS]),
-        accesses=int(row[cache.ACCESSES]),
-        hits=int(row[cache.HITS]),
-        line_misses=int(row[cache.LINE_MISSES]),
-        sector_misses=int(row[cache.SECTOR_MISSES]),
-        writes=int(row[cache.WRITES]),
-        write_misses=int(row[cache.WRITE_MISSES]),
-        stores_down=int(row[cache.STORES_DOWN]),
-        write_fills=int(row[cache.WRITE_FILLS]),
-        bypasses=int(row[cache.BYPASSES]),
-        bypassed_writes=int(row[cache.BYPASSED_WRITES]),
-        writebacks=int(row[cache.WRITEBACKS]),
-        dirty_at_end=dirty_at_end,
+        sector_bytes=level.sector_bytes,
+        requests=int(row[counts.REQUESTS]),
+        accesses=int(row[counts.ACCESSES]),
+        hits=int(row[counts.HITS]),
+        line_misses=int(row[counts.LINE_MISSES]),
+        sector_misses=int(row[counts.SECTOR_MISSES]),
+        merged=int(row[counts.MERGED]),
+        writes=int(row[counts.WRITES]),
+        write_misses=int(row[counts.WRITE_MISSES]),
+        stores_down=int(row[counts.STORES_DOWN]),
+        write_fills=int(row[counts.WRITE_FILLS]),
+        bypasses=int(row[counts.BYPASSES]),
+        bypassed_writes=int(row[counts.BYPASSED_WRITES]),
+        writebacks=int(row[counts.WRITEBACKS]),
+        dirty_at_end=int(level.dirty[groups].sum()),
     )
 
 

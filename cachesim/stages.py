@@ -8,9 +8,11 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 
 import numpy as np
+import numpy.typing as npt
 
 from cachesim.coalesce import groups_of, placement_of, program_of
 from cachesim.config import L1, FetchPath, Gpu
+from cachesim.counts import CountedLevel
 from cachesim.dispatch import Dispatcher
 from cachesim.hierarchy import BATCH_ROWS, Hierarchy
 from cachesim.level import Level
@@ -97,6 +99,35 @@ class Stages:
             self.hierarchy.end_launch()
             self._at_launch_end()
             self._launch = -1
+
+    @property
+    def lane_fetches(self) -> npt.NDArray[np.int64]:
+        """(groups,) lane fetches."""
+        return self.hierarchy.lane_fetches
+
+    @property
+    def num_rows(self) -> int:
+        """Access instructions issued so far."""
+        return self.hierarchy.num_rows
+
+    @property
+    def timings(self) -> dict[str, float]:
+        """Host seconds per stage."""
+        return dict(self.hierarchy.timings)
+
+    def counted_levels(self) -> list[CountedLevel]:
+        """The levels' counters, L1 first."""
+        groups = len(self.lane_fetches)
+        return [
+            CountedLevel(
+                level.name,
+                level.config.sector_bytes,
+                level.counters,
+                level.dirty_by_group(groups),
+                level.num_distinct,
+            )
+            for level in self.hierarchy.levels
+        ]
 
     def close(self) -> None:
         """End the stages' threads."""

@@ -245,9 +245,7 @@ class DramTiming(_Timing):
             )
         banks = 1 << letters.count("B")
         if banks != self.num_banks:
-            raise ValueError(
-                f"address_map names {banks} banks, num_banks = {self.num_banks}"
-            )
+            raise ValueError(f"address_map names {banks} banks, num_banks = {self.num_banks}")
         return self
 
     @property

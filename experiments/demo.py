@@ -81,7 +81,7 @@ def command(
     opened = open_device(device)
     # The simulator compiles on its first use, while the OpenCL device draws the scenes.
     with ThreadPoolExecutor(1) as pool:
-        compiling = pool.submit(compile_loops)
+        compiling = pool.submit(compile_loops, timing=bool(timed))
         with progress("rendering the scenes"), clock.stage("scenes"):
             gbuffers = {
                 name: load_scene(str(mesh or name), width, height, device=opened, **of_mesh(name))

@@ -73,7 +73,7 @@ def command(
     title = f"{trace.name} on {machine.name}"
     writer = timeline_file(timeline, machine.clock_hz, title) if timeline else nullcontext()
     with progress("compiling the simulator") as bar, writer as events:
-        compile_loops(lane_address=opened.is_lane_address)
+        compile_loops(lane_address=opened.is_lane_address, timing=timing)
         bar.describe(f"{'timing' if timing else 'counting'} on {machine.name}")
         start = monotonic()
         report = simulate(
@@ -82,13 +82,14 @@ def command(
             fetch_path=fetch_path,
             layout=layout,
             progress=bar.update,
-            **({"timing": True, "timeline": events} if timing else {}),
+            timing=timing,
+            timeline=events,
         )
         host_s = monotonic() - start
     text = dumps(report.to_json(), indent=2)
     if csv is not None:
         write_text(csv, _by_frame(report).to_csv(index=False))
-    if roofline is not None and getattr(report, "timing", None) is not None:
+    if roofline is not None and report.timing is not None:
         from experiments.roofline import roofline_figure
 
         write_figure(roofline, roofline_figure(report.timing, machine, title))
@@ -137,7 +138,7 @@ def print_stat_lines(report: Report, gpu: Gpu, name: str, host_s: float) -> None
     from experiments.gpgpusim_format import stat_lines
     from experiments.timing_tables import comparison_notes, is_gpgpusim
 
-    if getattr(report, "timing", None) is None:
+    if report.timing is None:
         raise ValueError("a report without timing has no stat lines")
     print(
         stat_lines(report.timing, gpu, fetch_path=report.fetch_path, name=name, host_s=host_s),
@@ -160,7 +161,7 @@ def print_report(report: Report, gpu: Gpu) -> None:
     print_table(level_table(report))
     if report.parts is not None:
         print_table(by_table(report))
-    if getattr(report, "timing", None) is not None:
+    if report.timing is not None:
         print_timing(report, gpu)
     stages = ", ".join(f"{name} {seconds:.2f} s" for name, seconds in report.timings.items())
     remark(f"time per stage: {stages}")
@@ -173,7 +174,7 @@ def print_timing(report: Report, gpu: Gpu) -> None:
     from experiments import timing_tables as tables
     from experiments.tables import print_table
 
-    if getattr(report, "timing", None) is None:
+    if report.timing is None:
         return
     print_table(tables.bandwidth_table(report.timing, gpu))
     print_table(tables.cycles_table(report.timing, gpu))

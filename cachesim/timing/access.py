@@ -17,10 +17,10 @@ from cachesim.counts import (
     HIT_THROUGH,
     HITS,
     LINE_MISSES,
+    MERGED,
     MISS_ALLOCATE,
     MISS_LAZY,
     MISS_NONE,
-    NUM_COUNTERS,
     REQUESTS,
     SECTOR_MISSES,
     STORES_DOWN,
@@ -56,8 +56,6 @@ from cachesim.timing.tags import (
 
 #: Rings of a node's `Tags.queues`.
 IN, DELAY, MISSES, DOWN, FILLS, OUT = range(6)
-#: Counter of merged misses, after those of `cachesim.counts`.
-MERGED = NUM_COUNTERS
 
 
 @compiled

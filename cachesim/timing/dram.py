@@ -12,7 +12,7 @@ from cachesim.timing.access import DOWN, drop_request
 from cachesim.timing.records import MAX_DRAM_BANKS, NEVER, WRITEBACK
 from cachesim.timing.slice import come_back
 
-_LINK = 3
+_LINK = 4
 
 
 @compiled

@@ -7,6 +7,8 @@ networks ──► SMs ──► CTAs
 
 from __future__ import annotations
 
+import numpy as np
+
 from cachesim.compiled import compiled
 from cachesim.timing.access import DOWN, OUT, drop_request, note, take_request
 from cachesim.timing.dram import is_idle, next_delay, step_channel
@@ -164,6 +166,20 @@ def _split(state, request, parts, shift):  # type: ignore[no-untyped-def]
 
 
 @compiled
+def _part_of_bytes(state, granules, part):  # type: ignore[no-untyped-def]
+    """The granules of one L2 sector of a store to a larger sector: one bit of the larger stands for
+    as many bytes as there are parts.
+    """
+    parts = state.pool.machine[0].line_parts
+    each = 32 // parts
+    covered = np.uint32(0)
+    for bit in range(32):
+        if (granules >> np.uint32(part * each + bit // parts)) & np.uint32(1):
+            covered |= np.uint32(1) << np.uint32(bit)
+    return covered
+
+
+@compiled
 def _receive_requests(state, node):  # type: ignore[no-untyped-def]
     """A slice takes a request from the network into its delay."""
     machine = state.pool.machine[0]
@@ -181,10 +197,16 @@ def _receive_requests(state, node):  # type: ignore[no-untyped-def]
         note(state.pool, S_REQUEST, request, now)
         one = state.pool.requests[request]
         delay = level.texture_latency if one.path == PATH_FIFO else level.latency
-        if one.path == PATH_FIFO and machine.line_parts > 1:
+        if machine.line_parts > 1:
             for part in range(machine.line_parts):
                 piece = _split(state, request, part, machine.l2_sector_shift)
+                if one.write:
+                    # Each part of a store is acknowledged by itself.
+                    state.pool.requests[piece].parent = -1
+                    state.pool.requests[piece].bytes = _part_of_bytes(state, one.bytes, part)
                 arrive(tags, state.pool, node, piece, now + delay)
+            if one.write:
+                drop_request(state.pool, request)
         else:
             arrive(tags, state.pool, node, request, now + delay)
         home.wake = min(home.wake, now)

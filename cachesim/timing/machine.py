@@ -190,7 +190,7 @@ def _tags(
         return Tags(
             np.zeros(1, records.LEVEL), np.zeros(0, records.NODE), np.zeros(0, records.LINE),
             none.view(np.uint32), none, np.zeros(0, records.SET), none, np.zeros(0, records.MSHR),
-            none, np.zeros((0, 256), np.uint32), np.zeros((num_groups, NUM_COUNTERS + 1), np.int64),
+            none, np.zeros((0, 256), np.uint32), np.zeros((num_groups, NUM_COUNTERS), np.int64),
             np.zeros((2, 6), np.int64), np.zeros((1, 6, 1), np.int32),
         )  # fmt: skip
     if isinstance(timing, CacheTiming):
@@ -213,7 +213,7 @@ def _tags(
         np.zeros(mshrs, records.MSHR),
         np.full(instances * (int(rules[0]["mshr_mask"]) + 1), -1, np.int32),
         set_hash(level).table,
-        np.zeros((num_groups, NUM_COUNTERS + 1), np.int64),
+        np.zeros((num_groups, NUM_COUNTERS), np.int64),
         np.zeros((2, 6), np.int64),
         np.zeros((instances, 6, room), np.int32),
     )
@@ -424,7 +424,10 @@ def build(gpu: Gpu, fetch_path: str, num_groups: int) -> State:
         sms,
         pipes,
         np.zeros(num_sms * MAX_WARPS, records.WARP),
-        *tags,
+        tags[0],
+        tags[1],
+        tags[2],
+        tags[3],
         _network(
             ports, gpu.l2.num_slices, icnt.input_packets, icnt.output_packets,
             icnt.request_latency_cycles, slack,

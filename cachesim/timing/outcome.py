@@ -9,11 +9,12 @@ import numpy as np
 import numpy.typing as npt
 
 from cachesim.config import Gpu
-from cachesim.counts import ACCESSES, BYPASSES
+from cachesim.counts import ACCESSES, BYPASSES, HIT_BACK
 from cachesim.timing import records
 from cachesim.timing.records import KINDS, NEVER, OUTCOMES, R_MEMORY
 from cachesim.timing.results import REASONS, LevelTiming, PassTiming
 from cachesim.timing.state import State
+from cachesim.timing.tags import Tags
 
 _DIRECT = {
     "issue": records.R_ISSUE,
@@ -85,8 +86,8 @@ def _where(before: Snapshot, after: Snapshot, num_sms: int, launch: int) -> dict
     memory["latency"] = max(0, latency - sum(memory.values()))
     shared = _shares(int(spent[R_MEMORY]), memory)
     sm_cycles = {name: int(spent[code]) for name, code in _DIRECT.items()}
-    for name, cycles in shared.items():
-        sm_cycles[name] = sm_cycles.get(name, 0) + cycles
+    for name, share in shared.items():
+        sm_cycles[name] = sm_cycles.get(name, 0) + share
     # While the kernel is launched every SM is idle.
     sm_cycles["idle"] = max(0, sm_cycles["idle"] - launch * num_sms)
     cycles = _shares(after.now - before.now - launch, sm_cycles)
@@ -97,11 +98,8 @@ def _where(before: Snapshot, after: Snapshot, num_sms: int, launch: int) -> dict
 def _peaks(gpu: Gpu) -> dict[str, int]:
     """Bytes per 1000 core cycles that each level can move."""
     assert gpu.l1_timing and gpu.l2_timing and gpu.dram_timing
-    l1, units = gpu.l1_timing, gpu.sm.count * gpu.l1.units_per_sm
-    per_unit = l1.num_banks * gpu.l1.sector_bytes
-    if l1.bytes_per_cycle:
-        per_unit = min(per_unit, l1.bytes_per_cycle)
-    peaks = {"l1": 1000 * units * per_unit}
+    units = gpu.sm.count * gpu.l1.units_per_sm
+    peaks = {"l1": 1000 * units * gpu.l1_timing.num_banks * gpu.l1.sector_bytes}
     if gpu.gl1 is not None and gpu.gl1_timing is not None:
         arrays = -(-gpu.sm.count // gpu.gl1.sms_per_instance)
         rate = gpu.gl1_timing.port_bytes * gpu.gl1_timing.clock_hz
@@ -158,6 +156,18 @@ def passes_of(name: str, before: Snapshot, after: Snapshot, gpu: Gpu, state: Sta
     )
 
 
+def dirty_sectors(tags: Tags, num_groups: int) -> npt.NDArray[np.int64]:
+    """(groups,) modified sectors that a write-back level holds, by the group that wrote them."""
+    dirty = np.zeros(num_groups, np.int64)
+    if len(tags.lines) and tags.level[0]["on_hit"] == HIT_BACK:
+        sectors = int(tags.level[0]["sectors_per_line"])
+        owner = tags.owner.reshape(-1, sectors)
+        for s in range(sectors):
+            held = (tags.lines["modified"] >> s) & 1 == 1
+            np.add.at(dirty, owner[held, s], 1)
+    return dirty
+
+
 def raw_counters(state: State, launches: Sequence[PassTiming]) -> dict[str, dict[str, int]]:
     """GPGPU-Sim's counters under its own names; those of stores with a leading "W_"."""
     machine = state.pool.machine[0]
@@ -177,6 +187,7 @@ def raw_counters(state: State, launches: Sequence[PassTiming]) -> dict[str, dict
     below = state.latency[1:].sum(axis=0)
     found["sm"] = {
         "gpu_sim_cycle": sum(one.cycles for one in launches),
+        "gpu_sim_insn": int(machine["instruction_threads"]),
         "gpgpu_n_tot_w_icount": sum(sum(one.warp_instructions.values()) for one in launches),
         "l1_bank_conflicts": int(machine["bank_conflicts"]),
         "averagemflatency_sum": int(below[0]),

@@ -235,7 +235,6 @@ def _new_request(state, unit, address, at, sector):  # type: ignore[no-untyped-d
     if one.write:
         where = state.work.written[at] + sector
         one.bytes = state.work.granules[where & (len(state.work.granules) - 1)]
-        state.warps[pipe.warp].stores += 1
     return index
 
 
@@ -263,7 +262,7 @@ def _issue_accesses(state, unit):  # type: ignore[no-untyped-def]
         while pipe.mask == 0 and pipe.at > pipe.first:
             pipe.at -= 1
             pipe.mask = work.mask[pipe.at & machine.request_mask]
-            if pipe.path == 0:
+            if pipe.path != PATH_BYPASS:
                 state.l1.counters[work.group[pipe.at & machine.request_mask], REQUESTS] += 1
         if pipe.mask == 0:
             break
@@ -278,8 +277,6 @@ def _issue_accesses(state, unit):  # type: ignore[no-untyped-def]
                 return False
             index = _new_request(state, unit, address, at, sector)
             if not send_up(state, index):
-                if state.pool.requests[index].write:
-                    state.warps[pipe.warp].stores -= 1
                 drop_request(state.pool, index)
                 pipe.blocked = R_INTERCONNECT
                 return False

@@ -53,7 +53,7 @@ REQUEST = np.dtype(
         ("born", "i8"),  # when it entered the load/store unit's hands
         ("mark", "i8"),  # when it entered the present stage
         ("number", "i8"),  # line number inside its L2 slice
-        ("next", "i4", (4,)),  # links of MSHR lists, one per level; [3] also of DRAM's bank lists
+        ("next", "i4", (5,)),  # links of MSHR lists, one per level, and of DRAM's bank lists
         ("parent", "i4"),  # the request it is a part of, or -1
         ("pending", "i4"),  # parts that have not returned
         ("warp", "i4"),  # sm * MAX_WARPS + slot, or -1

@@ -15,6 +15,7 @@ from cachesim.timing.records import (
     MAX_WARPS,
     MEMORY,
     NEVER,
+    PATH_BYPASS,
     R_ARITHMETIC,
     R_IDLE,
     R_ISSUE,
@@ -54,6 +55,23 @@ def _pick(state, index, scheduler, candidates):  # type: ignore[no-untyped-def]
         if (candidates >> U64(slot)) & U64(1):
             return slot
     return -1
+
+
+@compiled
+def _note_access(state, warp, row):  # type: ignore[no-untyped-def]
+    """What the warp will wait for: a load's sectors, or a store's acknowledgements. Returns the
+    load's number.
+    """
+    machine = state.pool.machine[0]
+    instruction = state.work.instructions[row.code]
+    if instruction.operation == STORE:
+        parts = machine.line_parts if instruction.path == PATH_BYPASS else 1
+        warp.stores += row.sectors * parts
+        return 0
+    load = warp.next_load
+    warp.pending[load & (MAX_LOADS - 1)] = max(1, row.sectors)
+    warp.next_load += 1
+    return load
 
 
 @compiled
@@ -166,10 +184,7 @@ def _enter_collectors(state, index, s, slot, warp, kind):  # type: ignore[no-unt
     if kind == MEMORY:
         row = state.work.rows[warp.row & machine.row_mask]
         sm.issued_row[s] = warp.row
-        if state.work.instructions[row.code].operation != STORE:
-            sm.issued_load[s] = warp.next_load
-            warp.pending[warp.next_load & (MAX_LOADS - 1)] = max(1, row.sectors)
-            warp.next_load += 1
+        sm.issued_load[s] = _note_access(state, warp, row)
     elif is_exit(warp):
         sm.issued_chain[place, s] = -1
         warp.exit_ready = NEVER
@@ -210,10 +225,7 @@ def _start_memory(state, index, scheduler, slot, warp, now):  # type: ignore[no-
     sm.queue_time[scheduler, at] = now + machine.memory_cycles - 1
     sm.queue_row[scheduler, at] = warp.row
     sm.queue_count[scheduler] += 1
-    if work.instructions[row.code].operation != STORE:
-        sm.queue_load[scheduler, at] = warp.next_load
-        warp.pending[warp.next_load & (MAX_LOADS - 1)] = max(1, row.sectors)
-        warp.next_load += 1
+    sm.queue_load[scheduler, at] = _note_access(state, warp, row)
 
 
 @compiled
@@ -264,6 +276,10 @@ def _issue(state, index, scheduler):  # type: ignore[no-untyped-def]
         else:
             _start_arithmetic(state, index, scheduler, warp, kind, now)
         state.issued[kind] += 1
+        lanes = 32
+        if kind == MEMORY:
+            lanes = state.work.rows[warp.row & machine.row_mask].lanes
+        machine.instruction_threads += lanes
         issued += 1
         previous = unit
         # Instructions are fetched in pairs; only the two of a pair can issue together.

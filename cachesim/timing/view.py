@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
-from llvmlite import ir
+from llvmlite import ir  # type: ignore[import-untyped]
 from numba import from_dtype, types
 from numba.core import cgutils
 from numba.core.imputils import lower_getattr_generic
@@ -24,7 +24,7 @@ _WORDS = 4
 _FIELDS: dict[str, dict[str, tuple[np.dtype[Any], int] | str]] = {}
 
 
-class ViewType(types.Type):  # type: ignore[misc]
+class ViewType(types.Type):
     """The type of a view, known by its name."""
 
     def __init__(self, view: str) -> None:
@@ -33,9 +33,9 @@ class ViewType(types.Type):  # type: ignore[misc]
 
 
 @register_model(ViewType)
-class _ViewModel(models.PrimitiveModel):  # type: ignore[misc]
+class _ViewModel(models.PrimitiveModel):
     def __init__(self, dmm: Any, fe_type: Any) -> None:
-        super().__init__(dmm, fe_type, ir.IntType(64))
+        super().__init__(dmm, fe_type, ir.IntType(64))  # type: ignore[no-untyped-call]
 
 
 def _field_type(view: str, field: str) -> Any:
@@ -49,14 +49,14 @@ def _field_type(view: str, field: str) -> Any:
 
 
 @infer_getattr
-class _ViewAttributes(AttributeTemplate):  # type: ignore[misc]
+class _ViewAttributes(AttributeTemplate):
     key = ViewType
 
-    def generic_resolve(self, value: Any, attr: str) -> Any:
+    def generic_resolve(self, value: Any, attr: str) -> Any:  # type: ignore[override]
         return _field_type(value.view, attr)
 
 
-@lower_getattr_generic(ViewType)
+@lower_getattr_generic(ViewType)  # type: ignore[no-untyped-call, untyped-decorator]
 def _read_field(context: Any, builder: Any, typ: Any, value: Any, attr: str) -> Any:
     """The array that the table describes."""
     result = _field_type(typ.view, attr)
@@ -68,7 +68,7 @@ def _read_field(context: Any, builder: Any, typ: Any, value: Any, attr: str) -> 
 
     if isinstance(result, ViewType):
         return word(0)
-    array = make_array(result)(context, builder)
+    array = make_array(result)(context, builder)  # type: ignore[no-untyped-call]
     data = builder.inttoptr(word(0), array.data.type)
     item = context.get_abi_sizeof(context.get_data_type(result.dtype))
     shape = [word(1 + k) for k in range(result.ndim)]
@@ -76,11 +76,11 @@ def _read_field(context: Any, builder: Any, typ: Any, value: Any, attr: str) -> 
     for length in reversed(shape):
         strides.append(step)
         step = builder.mul(step, length)
-    populate_array(
+    populate_array(  # type: ignore[no-untyped-call]
         array,
         data=data,
-        shape=cgutils.pack_array(builder, shape),
-        strides=cgutils.pack_array(builder, strides[::-1]),
+        shape=cgutils.pack_array(builder, shape),  # type: ignore[no-untyped-call]
+        strides=cgutils.pack_array(builder, strides[::-1]),  # type: ignore[no-untyped-call]
         itemsize=context.get_constant(types.intp, item),
         meminfo=None,
     )
@@ -100,7 +100,7 @@ def define(name: str, fields: Mapping[str, tuple[Any, int] | str]) -> None:
 def opener(name: str) -> Any:
     """A compiled function's way from an address to the view `name`."""
 
-    @intrinsic  # type: ignore[untyped-decorator]
+    @intrinsic
     def open_view(typingctx: Any, address: Any) -> Any:
         def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
             return arguments[0]

@@ -212,7 +212,7 @@ def advance(state, index, slot, now, again):  # type: ignore[no-untyped-def]
 
 @compiled
 def start_warp(state, index, slot, place, first, rows, age):  # type: ignore[no-untyped-def]
-    """Put a warp into a slot of an SM; it may issue once its instructions are fetched, two cycles later."""
+    """Put a warp into a slot of an SM. It may issue in two cycles, when it is fetched."""
     machine = state.pool.machine[0]
     sm = state.sms[index]
     work = state.work
