@@ -21,6 +21,7 @@ from cachesim.timing.records import (
     R_ISSUE,
     R_L1_BANDWIDTH,
     R_MEMORY,
+    SFU,
     WHEEL,
 )
 from cachesim.timing.warp import advance, is_exit, schedule, start_warp, wake_timed
@@ -28,6 +29,8 @@ from cachesim.timing.warp import advance, is_exit, schedule, start_warp, wake_ti
 U64 = np.uint64
 #: An instruction may issue this many cycles before its unit is free: it is collected meanwhile.
 _AHEAD = 3
+#: The order in which a port of GPGPU-Sim's operand collectors looks for instructions.
+_PORT_ORDER = (FP32, SFU, MEMORY, INT)
 
 
 @compiled
@@ -125,11 +128,40 @@ def _dispatch(state, index, s, c):  # type: ignore[no-untyped-def]
 
 
 @compiled
+def _allocate(state, index, kind):  # type: ignore[no-untyped-def]
+    """Give the oldest issued instruction of a kind a collector of its scheduler, if one is free."""
+    machine = state.pool.machine[0]
+    sm = state.sms[index]
+    oldest, order = -1, NEVER
+    for s in range(machine.num_schedulers):
+        if sm.issued_slot[kind, s] >= 0 and sm.issued_order[kind, s] < order:
+            oldest, order = s, sm.issued_order[kind, s]
+    if oldest < 0:
+        return False
+    for c in range(machine.collector_units):
+        if sm.collector_slot[oldest, c] >= 0:
+            continue
+        sm.collector_slot[oldest, c] = sm.issued_slot[kind, oldest]
+        sm.collector_kind[oldest, c] = sm.issued_kind[kind, oldest]
+        # One operand is read a step: arithmetic has two, a memory instruction its address, an exit
+        # none.
+        exits = sm.issued_chain[kind, oldest] < 0
+        sm.collector_ready[oldest, c] = 1 if exits else 0 if kind == MEMORY else -1
+        sm.collector_order[oldest, c] = order
+        sm.collector_chain[oldest, c] = sm.issued_chain[kind, oldest]
+        if kind == MEMORY:
+            sm.collector_row[oldest, c] = sm.issued_row[oldest]
+            sm.collector_load[oldest, c] = sm.issued_load[oldest]
+        sm.issued_slot[kind, oldest] = -1
+        return True
+    return False
+
+
+@compiled
 def _collect(state, index):  # type: ignore[no-untyped-def]
     """One cycle of GPGPU-Sim's operand collectors: two steps of dispatch, reads, allocation.
 
-    A scheduler's collectors are tried in their order, so that under pressure a later one waits; the
-    instructions of one kind enter in the order of issue, the oldest blocking the others.
+    A scheduler's collectors are tried in their order, so that under pressure a later one waits.
     """
     machine = state.pool.machine[0]
     sm = state.sms[index]
@@ -141,32 +173,13 @@ def _collect(state, index):  # type: ignore[no-untyped-def]
                         _dispatch(state, index, s, c)
                     else:
                         sm.collector_ready[s, c] += 1
-        for kind in range(5):
-            while True:
-                oldest, order = -1, NEVER
-                for s in range(machine.num_schedulers):
-                    if sm.issued_slot[kind, s] >= 0 and sm.issued_order[kind, s] < order:
-                        oldest, order = s, sm.issued_order[kind, s]
-                if oldest < 0:
-                    break
-                free = -1
-                for c in range(machine.collector_units):
-                    if sm.collector_slot[oldest, c] < 0:
-                        free = c
-                        break
-                if free < 0:
-                    break
-                sm.collector_slot[oldest, free] = sm.issued_slot[kind, oldest]
-                sm.collector_kind[oldest, free] = sm.issued_kind[kind, oldest]
-                # One operand is read a step; a memory instruction needs its address alone.
-                exits = sm.issued_chain[kind, oldest] < 0
-                sm.collector_ready[oldest, free] = 1 if exits else 0 if kind == MEMORY else -1
-                sm.collector_order[oldest, free] = order
-                sm.collector_chain[oldest, free] = sm.issued_chain[kind, oldest]
-                if kind == MEMORY:
-                    sm.collector_row[oldest, free] = sm.issued_row[oldest]
-                    sm.collector_load[oldest, free] = sm.issued_load[oldest]
-                sm.issued_slot[kind, oldest] = -1
+        # Each of the ports takes the oldest of every kind in turn; one that finds no collector of
+        # its scheduler free blocks its kind.
+        moved = True
+        while moved:
+            moved = False
+            for place in range(4):
+                moved |= _allocate(state, index, _PORT_ORDER[place])
 
 
 @compiled
