@@ -200,8 +200,8 @@ class Clock:
                 self._show_progress()
             if why in (engine.DONE, engine.NEEDS_CTAS):
                 return
-            if why == engine.NEEDS_POOL:
-                self.state = machine.larger_pool(self.state)
+            if why == engine.NEEDS_ROOM:
+                self.state = machine.with_more_room(self.state)
             elif why == engine.STUCK:
                 raise WorkError(f"the timing model is stuck: {self.describe_stuck()}")
             self._on_cycle(self.cycles)

@@ -13,7 +13,8 @@ from cachesim.compiled import compiled
 from cachesim.timing.access import DOWN, OUT, drop_request, note, take_request
 from cachesim.timing.dram import is_idle, next_delay, step_channel
 from cachesim.timing.network import AT_INPUTS, arrival, has_room, pop, push, transfer
-from cachesim.timing.pipe import inject, locate
+from cachesim.timing.partition import is_filling_table, locate
+from cachesim.timing.pipe import inject
 from cachesim.timing.records import NEVER, PATH_FIFO, S_REPLY, S_REQUEST, WRITEBACK
 from cachesim.timing.slice import arrive, come_back, step_cache
 from cachesim.timing.sm import place_ctas, step_sm
@@ -23,7 +24,7 @@ from cachesim.timing.view import opener, table_of
 _open_state = opener("State")
 
 #: Why the loop stopped.
-DONE, NEEDS_CTAS, NEEDS_POOL, STUCK, PAUSED = range(5)
+DONE, NEEDS_CTAS, NEEDS_ROOM, STUCK, PAUSED = range(5)
 #: Cycles without any progress after which the machine counts as stuck.
 PATIENCE = 100_000
 
@@ -335,8 +336,12 @@ def _run(address, pause):  # type: ignore[no-untyped-def]
     while True:
         if not machine.complete and machine.queued - machine.taken < machine.num_sms:
             return NEEDS_CTAS
-        if machine.free_top < machine.num_pool:
-            return NEEDS_POOL
+        if (
+            machine.free_top < machine.num_pool
+            or is_filling_table(state.l2_route.draws)
+            or is_filling_table(state.llc_route.draws)
+        ):
+            return NEEDS_ROOM
         if machine.now >= pause:
             return PAUSED
         now = machine.now
@@ -385,4 +390,4 @@ def run(state: State, pause: int) -> int:
     return int(_run(table.address, pause))
 
 
-__all__ = ["DONE", "NEEDS_CTAS", "NEEDS_POOL", "PAUSED", "STUCK", "run"]
+__all__ = ["DONE", "NEEDS_CTAS", "NEEDS_ROOM", "PAUSED", "STUCK", "run"]

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from cachesim.address import partition_of, set_hash
+from cachesim.address import RANDOM, partition_of, set_hash
 from cachesim.config import L2, CacheLevel, Gpu
 from cachesim.counts import (
     HIT_BACK,
@@ -24,6 +24,7 @@ from cachesim.counts import (
 )
 from cachesim.timing import records
 from cachesim.timing.network import Network
+from cachesim.timing.partition import is_filling_table, larger_draws, new_draws
 from cachesim.timing.records import (
     MAX_BANKS,
     MAX_DRAM_BANKS,
@@ -54,6 +55,7 @@ _ON_MISS = {
     "lazy-fetch-on-read": MISS_LAZY,
 }
 _FIRST_POOL = 1 << 14
+_FIRST_DRAWS = 1 << 15
 
 
 def power_of_two(number: int) -> int:
@@ -249,13 +251,14 @@ def forget_lines(tags: Tags) -> None:
 
 def _route(level: L2 | None) -> Route:
     if level is None:
-        return Route(np.zeros(7, np.int64), np.zeros((0, 256), np.uint32))
+        return Route(np.zeros(7, np.int64), np.zeros((0, 256), np.uint32), new_draws(1))
     part = partition_of(level)
     numbers = [
         part.num_channels, part.slices_per_channel, part.run_shift, part.hash.kind,
         part.hash.size, part.xor, _log2(level.line_bytes),
     ]  # fmt: skip
-    return Route(np.array(numbers, np.int64), part.hash.table)
+    size = _FIRST_DRAWS if part.hash.kind == RANDOM else 1
+    return Route(np.array(numbers, np.int64), part.hash.table, new_draws(size))
 
 
 def _network(
@@ -464,9 +467,17 @@ def empty_work() -> Work:
     )  # fmt: skip
 
 
-def larger_pool(state: State) -> State:
-    """The same state with twice as many requests in its pool."""
+def with_more_room(state: State) -> State:
+    """The same state with larger tables of drawn slices where they fill up, and twice as many
+    requests in its pool where that runs out.
+    """
+    for name in ("l2_route", "llc_route"):
+        route: Route = getattr(state, name)
+        if is_filling_table(route.draws):
+            state = state._replace(**{name: route._replace(draws=larger_draws(route.draws))})
     pool = state.pool
+    if pool.machine[0]["free_top"] >= pool.machine[0]["num_pool"]:
+        return state
     old = len(pool.requests)
     requests = np.zeros(2 * old, records.REQUEST)
     requests[:old] = pool.requests

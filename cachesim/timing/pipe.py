@@ -9,13 +9,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from cachesim.address import slice_and_line
 from cachesim.compiled import compiled
 from cachesim.counts import REQUESTS
 from cachesim.stream import ATOMIC, LOAD, STORE
 from cachesim.timing import fifo
 from cachesim.timing.access import MISSES, access, count_bypass, drop_request, fill, take_request
 from cachesim.timing.network import has_room, push
+from cachesim.timing.partition import locate, touch_address
 from cachesim.timing.records import (
     DEMANDED,
     FAIL,
@@ -32,24 +32,6 @@ from cachesim.timing.tags import next_ready
 from cachesim.timing.warp import sector_back, store_done
 
 U64 = np.uint64
-
-
-@compiled
-def locate(route, address):  # type: ignore[no-untyped-def]
-    """(slice, line number inside it) of an address."""
-    numbers = route.numbers
-    where, number = slice_and_line(
-        U64(address),
-        U64(numbers[0]),
-        U64(numbers[1]),
-        U64(numbers[2]),
-        numbers[3],
-        numbers[4],
-        route.table,
-        numbers[5],
-        U64(numbers[6]),
-    )
-    return np.int64(where), np.int64(number)
 
 
 @compiled
@@ -289,6 +271,7 @@ def _issue_accesses(state, unit):  # type: ignore[no-untyped-def]
             fifo.access(state, unit, index)
         else:
             bank = (address >> machine.bank_shift) & (machine.num_banks - 1)
+            touch_address(state.l2_route, address)
             if pipe.bank_count[bank] >= machine.l1_latency or pipe.bank_entered[bank] == now:
                 machine.bank_conflicts += 1
                 if pipe.blocked == 0:
@@ -398,4 +381,4 @@ def step_pipe(state, index, unit):  # type: ignore[no-untyped-def]
         _take_instruction(state, index, unit)
 
 
-__all__ = ["HIT", "inject", "locate", "send_up", "step_pipe"]
+__all__ = ["HIT", "inject", "send_up", "step_pipe"]

@@ -49,11 +49,13 @@ class Work(NamedTuple):
 
 class Route(NamedTuple):
     """How addresses spread over a sliced level: `address.Partition`'s numbers as int64 [channels,
-    slices per channel, run shift, kind, slices, xor, line shift], and its table.
+    slices per channel, run shift, kind, slices, xor, line shift], and its table. draws: int64, the
+    slices drawn so far (`partition`).
     """
 
     numbers: npt.NDArray[np.int64]
     table: npt.NDArray[np.uint32]
+    draws: npt.NDArray[np.int64]
 
 
 class Memory(NamedTuple):
@@ -145,7 +147,7 @@ define(
         "cta_left": (_U8, 1),
     },
 )
-define("Route", {"numbers": (_I64, 1), "table": (_U32, 2)})
+define("Route", {"numbers": (_I64, 1), "table": (_U32, 2), "draws": (_I64, 1)})
 define(
     "Memory",
     {

@@ -1,0 +1,119 @@
+"""Which slice an address goes to. A "random" partition is drawn at an address's first touch, as
+GPGPU-Sim does it (facts sheet 3.4): the number of draws per slice, and with it the load of the
+fullest slice, are then the simulator's own.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from cachesim.address import RANDOM, slice_and_line
+from cachesim.compiled import compiled
+
+U64 = np.uint64
+#: Places in `Route.draws` before its hash table: how many runs were drawn, the generator's next
+#: place, and its 31 numbers.
+DRAWN, NEXT, NUMBERS = 0, 1, 2
+TABLE = NUMBERS + 31
+_LAG = 31
+
+
+def generator(seed: int = 1) -> npt.NDArray[np.int64]:
+    """The numbers of the C library's additive feedback generator (x[i] = x[i-3] + x[i-31] modulo
+    2^32, output x >> 1) after its first 310 outputs, oldest first.
+    """
+    numbers = [seed]
+    for _ in range(30):
+        numbers.append(16807 * numbers[-1] % 2147483647)
+    numbers += numbers[:3]
+    for i in range(34, 344):
+        numbers.append((numbers[i - 3] + numbers[i - 31]) % (1 << 32))
+    return np.array(numbers[-_LAG:], np.int64)
+
+
+def new_draws(size: int) -> npt.NDArray[np.int64]:
+    """An empty table of drawn runs with room for `size` entries (a power of two)."""
+    draws = np.full(TABLE + 2 * size, -1, np.int64)
+    draws[DRAWN] = draws[NEXT] = 0
+    draws[NUMBERS:TABLE] = generator()
+    return draws
+
+
+def larger_draws(draws: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
+    """The same draws in a table of twice the size."""
+    entries = draws[TABLE:].reshape(-1, 2)
+    larger = new_draws(2 * len(entries))
+    larger[:TABLE] = draws[:TABLE]
+    for run, where in entries[entries[:, 0] >= 0]:
+        _put(larger, run, where)
+    return larger
+
+
+@compiled
+def _slot(draws, run):  # type: ignore[no-untyped-def]
+    """Where a run stands in the table, or would stand."""
+    mask = (len(draws) - TABLE) // 2 - 1
+    at = ((run * 0x1E3779B97F4A7C15) >> 24) & mask
+    while draws[TABLE + 2 * at] >= 0 and draws[TABLE + 2 * at] != run:
+        at = (at + 1) & mask
+    return TABLE + 2 * at
+
+
+@compiled
+def _put(draws, run, where):  # type: ignore[no-untyped-def]
+    at = _slot(draws, run)
+    draws[at] = run
+    draws[at + 1] = where
+
+
+@compiled
+def _draw(draws, slices):  # type: ignore[no-untyped-def]
+    """The next number of the generator, modulo the number of slices."""
+    at = draws[NEXT]
+    back = at + _LAG - 3
+    value = (draws[NUMBERS + (back if back < _LAG else back - _LAG)] + draws[NUMBERS + at]) & (
+        (1 << 32) - 1
+    )
+    draws[NUMBERS + at] = value
+    draws[NEXT] = at + 1 if at + 1 < _LAG else 0
+    return (value >> 1) % slices
+
+
+@compiled
+def touch_address(route, address):  # type: ignore[no-untyped-def]
+    """Draw an address's slice if nobody asked for it before."""
+    if route.numbers[3] == RANDOM:
+        run = address >> route.numbers[2]
+        at = _slot(route.draws, run)
+        if route.draws[at] < 0:
+            route.draws[at] = run
+            route.draws[at + 1] = _draw(route.draws, route.numbers[4])
+            route.draws[DRAWN] += 1
+
+
+@compiled
+def locate(route, address):  # type: ignore[no-untyped-def]
+    """(slice, line number inside it) of an address."""
+    numbers = route.numbers
+    where, number = slice_and_line(
+        U64(address),
+        U64(numbers[0]),
+        U64(numbers[1]),
+        U64(numbers[2]),
+        numbers[3],
+        numbers[4],
+        route.table,
+        numbers[5],
+        U64(numbers[6]),
+    )
+    if numbers[3] == RANDOM:
+        touch_address(route, address)
+        return route.draws[_slot(route.draws, address >> numbers[2]) + 1], np.int64(number)
+    return np.int64(where), np.int64(number)
+
+
+@compiled
+def is_filling_table(draws):  # type: ignore[no-untyped-def]
+    """Whether a table of draws is half full."""
+    return draws[DRAWN] * 4 > len(draws) - TABLE
