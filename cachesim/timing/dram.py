@@ -6,6 +6,8 @@ command cycle, both with a dual bus; credits bound what a slice may have in flig
 
 from __future__ import annotations
 
+import numpy as np
+
 from cachesim.compiled import compiled
 from cachesim.stream import LOAD
 from cachesim.timing.access import DOWN, drop_request
@@ -13,6 +15,7 @@ from cachesim.timing.records import MAX_DRAM_BANKS, NEVER, WRITEBACK
 from cachesim.timing.slice import come_back
 
 _LINK = 4
+U64 = np.uint64
 
 
 @compiled
@@ -119,13 +122,16 @@ def _serve_bank(state, index):  # type: ignore[no-untyped-def]
     channel = memory.channels[index]
     requests = state.pool.requests
     num_banks = machine.num_dram_banks
+    free = channel.waiting & ~channel.serving
+    if free == 0:
+        return False
     for k in range(num_banks):
         b = k + channel.priority
         if b >= num_banks:
             b -= num_banks
-        bank = memory.banks[index * MAX_DRAM_BANKS + b]
-        if bank.serving >= 0 or bank.first < 0:
+        if (free >> U64(b)) & U64(1) == 0:
             continue
+        bank = memory.banks[index * MAX_DRAM_BANKS + b]
         chosen, before = bank.first, -1
         if machine.fr_fcfs and bank.open_row >= 0:
             at, previous = bank.first, -1
@@ -142,7 +148,12 @@ def _serve_bank(state, index):  # type: ignore[no-untyped-def]
             requests[before].next[_LINK] = following
         if bank.last == chosen:
             bank.last = before
+        if bank.first < 0:
+            channel.waiting &= ~(U64(1) << U64(b))
+        channel.serving |= U64(1) << U64(b)
         bank.serving = chosen
+        bank.row = requests[chosen].row
+        bank.write = requests[chosen].write
         bank.left = requests[chosen].pending
         channel.pending -= 1
         channel.num_serving += 1
@@ -165,16 +176,15 @@ def _column_command(state, index):  # type: ignore[no-untyped-def]
         b = k + channel.priority
         if b >= num_banks:
             b -= num_banks
-        bank = memory.banks[index * MAX_DRAM_BANKS + b]
-        if bank.serving < 0:
+        if (channel.serving >> U64(b)) & U64(1) == 0:
             continue
-        one = state.pool.requests[bank.serving]
-        if bank.open_row != one.row:
+        bank = memory.banks[index * MAX_DRAM_BANKS + b]
+        if bank.open_row != bank.row:
             continue
         group = memory.groups[index * MAX_DRAM_BANKS + (b & machine.group_mask)]
         if group.ccdl > tick:
             continue
-        if one.write:
+        if bank.write:
             if bank.rcdwr > tick or channel.rtw > tick:
                 continue
             channel.is_writing = 1
@@ -201,6 +211,7 @@ def _column_command(state, index):  # type: ignore[no-untyped-def]
         bank.left -= 1
         if bank.left == 0:
             bank.serving = -1
+            channel.serving &= ~(U64(1) << U64(b))
             channel.num_serving -= 1
         return True
     return False
@@ -218,10 +229,10 @@ def _row_command(state, index):  # type: ignore[no-untyped-def]
         b = k + channel.priority
         if b >= num_banks:
             b -= num_banks
-        bank = memory.banks[index * MAX_DRAM_BANKS + b]
-        if bank.serving < 0:
+        if (channel.serving >> U64(b)) & U64(1) == 0:
             continue
-        row = state.pool.requests[bank.serving].row
+        bank = memory.banks[index * MAX_DRAM_BANKS + b]
+        row = bank.row
         if bank.open_row < 0:
             if channel.rrd <= tick and bank.rp <= tick and bank.rc <= tick:
                 bank.open_row = row
@@ -263,6 +274,7 @@ def _enter(state, index):  # type: ignore[no-untyped-def]
         else:
             requests[bank.last].next[_LINK] = request
         bank.last = request
+        channel.waiting |= U64(1) << U64(one.bank)
         channel.pending += 1
 
 

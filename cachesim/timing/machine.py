@@ -294,6 +294,9 @@ def _memory(gpu: Gpu, channels: int) -> Memory:
     timing = gpu.dram_timing
     assert timing
     room = power_of_two(timing.queue + timing.return_queue + 8 * MAX_SUBSLICES)
+    # While the return queue is full, the bursts of all that credits admit may wait for it.
+    last = gpu.llc or gpu.l2
+    bursts = power_of_two(room * (last.sector_bytes // timing.atom_bytes))
     memory = Memory(
         np.zeros(channels, records.CHANNEL),
         np.zeros(channels * MAX_DRAM_BANKS, records.BANK),
@@ -301,8 +304,8 @@ def _memory(gpu: Gpu, channels: int) -> Memory:
         np.zeros((channels, room), np.int32),
         np.zeros((channels, room), np.int64),
         np.zeros((channels, room), np.int32),
-        np.zeros((channels, power_of_two(timing.cl + timing.wl + 4)), np.int32),
-        np.zeros((channels, power_of_two(timing.cl + timing.wl + 4)), np.int64),
+        np.zeros((channels, bursts), np.int32),
+        np.zeros((channels, bursts), np.int64),
         np.zeros((channels, room), np.int32),
         _address_bits(timing.address_map),
     )
@@ -467,14 +470,19 @@ def empty_work() -> Work:
     )  # fmt: skip
 
 
+def _with_room(route: Route) -> Route:
+    if not is_filling_table(route.draws):
+        return route
+    return route._replace(draws=larger_draws(route.draws))
+
+
 def with_more_room(state: State) -> State:
     """The same state with larger tables of drawn slices where they fill up, and twice as many
     requests in its pool where that runs out.
     """
-    for name in ("l2_route", "llc_route"):
-        route: Route = getattr(state, name)
-        if is_filling_table(route.draws):
-            state = state._replace(**{name: route._replace(draws=larger_draws(route.draws))})
+    state = state._replace(
+        l2_route=_with_room(state.l2_route), llc_route=_with_room(state.llc_route)
+    )
     pool = state.pool
     if pool.machine[0]["free_top"] >= pool.machine[0]["num_pool"]:
         return state

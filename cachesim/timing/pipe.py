@@ -46,8 +46,10 @@ def send_up(state, request):  # type: ignore[no-untyped-def]
             return False
         room = state.gl1.queues.shape[2] - 1
         state.gl1.queues[one.port, 1, (node.delay_head + node.delay_count) & room] = request
-        node.delay_count += 1
         one.ready = machine.now + 1 + level.latency
+        if node.delay_count == 0:
+            node.delay_ready = one.ready
+        node.delay_count += 1
         one.mark = machine.now
         node.wake = min(node.wake, one.ready)
         return True
@@ -164,23 +166,27 @@ def _look_up(state, unit):  # type: ignore[no-untyped-def]
     for bank in range(machine.num_banks):
         if pipe.bank_count[bank] == 0:
             continue
-        request = state.banks[unit * machine.num_banks + bank, pipe.bank_head[bank] & room]
-        one = state.pool.requests[request]
-        if one.ready > now:
+        if pipe.bank_ready[bank] > now:
             continue
         if pipe.bank_failed[bank] == node.version:
-            state.l1.outcomes[1 if one.write else 0, FAIL] += 1
+            state.l1.outcomes[pipe.bank_write[bank], FAIL] += 1
             pipe.blocked = R_L1_RESERVATION
             continue
+        request = state.banks[unit * machine.num_banks + bank, pipe.bank_head[bank] & room]
+        one = state.pool.requests[request]
         outcome, sent = access(state.l1, state.pool, unit, request, now)
         if outcome == FAIL:
             pipe.bank_failed[bank] = node.version
+            pipe.bank_write[bank] = one.write
             pipe.blocked = R_L1_RESERVATION
             continue
         pipe.bank_failed[bank] = -1
         pipe.bank_head[bank] = (pipe.bank_head[bank] + 1) & room
         pipe.bank_count[bank] -= 1
         pipe.in_banks -= 1
+        if pipe.bank_count[bank] > 0:
+            following = state.banks[unit * machine.num_banks + bank, pipe.bank_head[bank] & room]
+            pipe.bank_ready[bank] = state.pool.requests[following].ready
         if one.operation == STORE:
             node.version += 1
             if not sent:
@@ -281,6 +287,8 @@ def _issue_accesses(state, unit):  # type: ignore[no-untyped-def]
             state.pool.requests[index].ready = now + machine.l1_latency
             place = (pipe.bank_head[bank] + pipe.bank_count[bank]) & room
             state.banks[unit * machine.num_banks + bank, place] = index
+            if pipe.bank_count[bank] == 0:
+                pipe.bank_ready[bank] = now + machine.l1_latency
             pipe.bank_count[bank] += 1
             pipe.bank_entered[bank] = now
             pipe.in_banks += 1

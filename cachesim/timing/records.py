@@ -113,6 +113,8 @@ NODE = np.dtype(
         ("fill_time", "i8"),
         ("version", "i8"),  # counts what may turn a reservation fail into success
         ("failed", "i8"),  # version at which the head of the queue failed, or -1
+        ("failed_write", "i8"),  # whether it is a store
+        ("delay_ready", "i8"),  # of the oldest request in the delay
         ("dirty_lines", "i8"),
         ("mshr_free", "i4"),
         ("mshr_used", "i4"),
@@ -171,6 +173,7 @@ SM = np.dtype(
         ("queue_row", "i8", (MAX_SCHEDULERS, MAX_MEMORY_QUEUE)),
         # GPGPU-Sim's operand collectors: issued[kind, scheduler], then collector[scheduler, unit].
         ("num_collecting", "i4"),
+        ("num_issued", "i4", (5,)),  # of each kind, not yet in a collector
         ("issued_slot", "i4", (5, MAX_SCHEDULERS)),
         ("issued_order", "i8", (5, MAX_SCHEDULERS)),
         ("issued_chain", "i4", (5, MAX_SCHEDULERS)),
@@ -216,6 +219,8 @@ PIPE = np.dtype(
         ("bank_count", "i4", (MAX_BANKS,)),
         ("bank_entered", "i8", (MAX_BANKS,)),
         ("bank_failed", "i8", (MAX_BANKS,)),
+        ("bank_ready", "i8", (MAX_BANKS,)),  # of the oldest access in it
+        ("bank_write", "i4", (MAX_BANKS,)),  # whether the one that failed is a store
         ("in_banks", "i8"),
         ("blocked", "i4"),  # 0, or why nothing left the pipe this cycle
         ("rob_head", "i4"),  # the texture FIFOs
@@ -309,6 +314,8 @@ CHANNEL = np.dtype(
         ("priority", "i4"),
         ("pending", "i4"),
         ("num_serving", "i4"),
+        ("serving", "u8"),  # mask of banks that have a request
+        ("waiting", "u8"),  # mask of banks with requests behind
         ("last_borrower", "i4"),
         ("shared_credit", "i4"),
         ("private_credit", "i4", (MAX_SUBSLICES,)),
@@ -328,6 +335,8 @@ BANK = np.dtype(
         ("serving", "i4"),
         ("left", "i4"),  # bursts of `serving`
         ("open_row", "i4"),  # -1 = none
+        ("row", "i4"),  # of `serving`
+        ("write", "i4"),
         ("first", "i4"),
         ("last", "i4"),
         ("rcd", "i8"),

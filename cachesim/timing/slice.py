@@ -124,11 +124,11 @@ def _look_up(tags, pool, node, now):  # type: ignore[no-untyped-def]
         or home.port_time > now * 256
     ):
         return False
+    if home.failed == home.version:
+        tags.outcomes[home.failed_write, FAIL] += 1
+        return False
     request = _front(tags, node, IN, home.in_head)
     one = pool.requests[request]
-    if home.failed == home.version:
-        tags.outcomes[1 if one.write else 0, FAIL] += 1
-        return False
     # A read-only level and what may not be looked up: stores, atomics and bypassing loads pass.
     goes_around = level.is_read_only and (one.operation != LOAD or one.path == 1)
     if goes_around or (one.operation == ATOMIC and level.on_hit != HIT_BACK):
@@ -140,6 +140,7 @@ def _look_up(tags, pool, node, now):  # type: ignore[no-untyped-def]
         outcome, sent = access(tags, pool, node, request, now)
         if outcome == FAIL:
             home.failed = home.version
+            home.failed_write = one.write
             return False
         if outcome == HIT or one.operation == STORE:
             home.port_time = max(home.port_time, (now - 1) * 256 + 1) + level.port_cost
@@ -168,13 +169,16 @@ def _leave_delay(tags, pool, node, now):  # type: ignore[no-untyped-def]
     home = tags.nodes[node]
     if home.delay_count == 0 or home.in_count >= tags.level[0].queue_in:
         return False
-    request = _front(tags, node, DELAY, home.delay_head)
-    if pool.requests[request].ready > now:
+    if home.delay_ready > now:
         return False
+    request = _front(tags, node, DELAY, home.delay_head)
     _push(tags, node, IN, home.in_head, home.in_count, request)
     home.in_count += 1
     home.delay_head += 1
     home.delay_count -= 1
+    if home.delay_count > 0:
+        following = _front(tags, node, DELAY, home.delay_head)
+        home.delay_ready = pool.requests[following].ready
     return True
 
 
@@ -184,6 +188,8 @@ def arrive(tags, pool, node, request, ready):  # type: ignore[no-untyped-def]
     home = tags.nodes[node]
     pool.requests[request].ready = ready
     _push(tags, node, DELAY, home.delay_head, home.delay_count, request)
+    if home.delay_count == 0:
+        home.delay_ready = ready
     home.delay_count += 1
 
 
@@ -227,8 +233,7 @@ def step_cache(tags, pool, node, now):  # type: ignore[no-untyped-def]
     ):
         home.wake = now + 1
     elif home.delay_count > 0:
-        request = _front(tags, node, DELAY, home.delay_head)
-        home.wake = max(now + 1, pool.requests[request].ready)
+        home.wake = max(now + 1, home.delay_ready)
     else:
         home.wake = NEVER
 

@@ -132,6 +132,8 @@ def _allocate(state, index, kind):  # type: ignore[no-untyped-def]
     """Give the oldest issued instruction of a kind a collector of its scheduler, if one is free."""
     machine = state.pool.machine[0]
     sm = state.sms[index]
+    if sm.num_issued[kind] == 0:
+        return False
     oldest, order = -1, NEVER
     for s in range(machine.num_schedulers):
         if sm.issued_slot[kind, s] >= 0 and sm.issued_order[kind, s] < order:
@@ -153,6 +155,7 @@ def _allocate(state, index, kind):  # type: ignore[no-untyped-def]
             sm.collector_row[oldest, c] = sm.issued_row[oldest]
             sm.collector_load[oldest, c] = sm.issued_load[oldest]
         sm.issued_slot[kind, oldest] = -1
+        sm.num_issued[kind] -= 1
         return True
     return False
 
@@ -191,6 +194,7 @@ def _enter_collectors(state, index, s, slot, warp, kind):  # type: ignore[no-unt
     sm.order += 1
     sm.num_collecting += 1
     sm.issued_slot[place, s] = slot
+    sm.num_issued[place] += 1
     sm.issued_order[place, s] = sm.order
     sm.issued_chain[place, s] = warp.chain
     sm.issued_kind[place, s] = kind
@@ -345,11 +349,9 @@ def _next_event(state, index):  # type: ignore[no-untyped-def]
             if state.pool.requests[state.fifo[unit, 0, pipe.fragment_head & room]].pending == 0:
                 return now + 1
         if pipe.in_banks > 0:
-            room = state.banks.shape[1] - 1
             for bank in range(machine.num_banks):
                 if pipe.bank_count[bank] > 0:
-                    at = state.banks[unit * machine.num_banks + bank, pipe.bank_head[bank] & room]
-                    soonest = min(soonest, max(now + 1, state.pool.requests[at].ready))
+                    soonest = min(soonest, max(now + 1, pipe.bank_ready[bank]))
     if sm.num_timed > 0:
         for ahead in range(1, WHEEL):
             if now + ahead >= soonest:
