@@ -93,11 +93,14 @@ class L1Timing(_Timing):
     latency_cycles: from entering the L1 to its tag look-up; a hit's data is there then, and a miss
         pays it too. texture_latency_cycles: the same for fetch path "texture".
     num_banks: accesses that may enter in a cycle, one per bank; bank_bytes: their interleaving.
-    lines_per_cycle: tags that one instruction may look up in a cycle; 0 = no limit.
+    lines_per_cycle: tags that one instruction may look up in a cycle; then num_banks accesses of
+        these lines may enter, and none clash. 0 = the banks alone limit.
     bytes_per_cycle: data returned to the SM in a cycle; 0 = no limit.
     num_mshrs, mshr_merge: misses in flight, and requests per miss, the first included.
-    miss_queue: entries; one leaves per cycle. allocation: when a line is taken.
-    fill_bytes_per_cycle: of the port by which replies enter.
+    miss_queue: entries. allocation: when a line is taken.
+    fill_bytes_per_cycle: of the port by which replies enter; with output-queued interconnects as
+        many misses leave in a cycle, and bytes_per_cycle of data return to the registers. With
+        others it is one sector each.
     dirty_limit_percent: dirty lines are spared from eviction below this share of dirty lines.
     """
 
@@ -168,7 +171,8 @@ class Icnt(_Timing):
     inputs_match_again: an input that sent a packet may send its next one to a later output in the
         same cycle (GPGPU-Sim's built-in crossbar).
     request_latency_cycles, reply_latency_cycles: on top of one cycle's transfer.
-    flit_bytes: a packet of n flits holds its output for n cycles. header_bytes: of each packet.
+    flit_bytes: an output moves so many in a cycle; at "input-fifo" a packet holds it for whole
+        cycles. header_bytes: of each packet.
     input_packets, output_packets: room of each port's buffer.
     ejection_packets: room for replies at each SM. response_packets: of the load/store unit's FIFO.
     """

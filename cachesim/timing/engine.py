@@ -39,28 +39,31 @@ def _give_to_sm(state, index, request):  # type: ignore[no-untyped-def]
 
 @compiled
 def _receive_replies(state):  # type: ignore[no-untyped-def]
-    """Each SM passes one reply to its load/store unit and takes one from the network or GL1."""
+    """Each SM passes replies to its load/store units and takes some from the network: one a cycle
+    in GPGPU-Sim, what its port moves on hardware.
+    """
     machine = state.pool.machine[0]
     now = machine.now
     for index in range(machine.num_sms):
         sm = state.sms[index]
-        if sm.eject_count > 0:
+        for _ in range(machine.replies_per_cycle):
+            if sm.eject_count == 0:
+                break
             room = state.ejection.shape[1] - 1
             request = state.ejection[index, sm.eject_head & room]
             unit = state.pool.requests[request].unit
             pipe = state.pipes[unit]
-            if pipe.response_count < machine.response:
-                sm.eject_head = (sm.eject_head + 1) & room
-                sm.eject_count -= 1
-                to = state.responses.shape[1] - 1
-                state.responses[unit, (pipe.response_head + pipe.response_count) & to] = request
-                pipe.response_count += 1
-                sm.wake = min(sm.wake, now)
-        if (
-            not machine.has_gl1
-            and sm.eject_count < machine.ejection
-            and arrival(state.down, index) <= now
-        ):
+            if pipe.response_count >= machine.response:
+                break
+            sm.eject_head = (sm.eject_head + 1) & room
+            sm.eject_count -= 1
+            to = state.responses.shape[1] - 1
+            state.responses[unit, (pipe.response_head + pipe.response_count) & to] = request
+            pipe.response_count += 1
+            sm.wake = min(sm.wake, now)
+        for _ in range(0 if machine.has_gl1 else machine.replies_per_cycle):
+            if sm.eject_count >= machine.ejection or arrival(state.down, index) > now:
+                break
             request = pop(state.down, index)
             note(state.pool, S_REPLY, request, now)
             _give_to_sm(state, index, request)

@@ -165,7 +165,7 @@ def _level_rules(
     if isinstance(timing, CacheTiming):
         cost = 256 * level.sector_bytes * core_hz // (timing.port_bytes * timing.clock_hz)
         one["port_cost"] = one["fill_cost"] = max(1, cost)
-        one["width"] = max(1, 256 // max(1, cost))
+        one["width"] = -(-256 // max(1, cost))
         one["latency"] = timing.latency_cycles
         one["texture_latency"] = getattr(timing, "texture_latency_cycles", timing.latency_cycles)
         one["queue_in"], one["queue_down"] = timing.queue_in, timing.queue_down
@@ -372,7 +372,16 @@ def build(gpu: Gpu, fetch_path: str, num_groups: int) -> State:
         "channel_shift": int(dram.address_map.partition("@")[2].partition(";")[0]),
         "sector_shift": _log2(l1.sector_bytes), "line_parts": line_parts,
         "store_bytes": gpu.l1.sector_bytes, "last_sm": num_sms - 1,
+        "sectors_per_cycle": 1, "returns_per_cycle": 1, "replies_per_cycle": 1,
     }  # fmt: skip
+    if icnt.queueing == "output-queued":
+        # Hardware moves what its ports are wide; GPGPU-Sim one sector a cycle everywhere.
+        packet = gpu.l2.sector_bytes + icnt.header_bytes
+        rules |= {
+            "sectors_per_cycle": max(1, l1_timing.fill_bytes_per_cycle // l1.sector_bytes),
+            "returns_per_cycle": max(1, l1_timing.bytes_per_cycle // l1.sector_bytes),
+            "replies_per_cycle": max(1, icnt.flit_bytes // packet),
+        }
     if fifo:
         rules |= {
             "fragment_fifo": fifo.fragment_fifo, "request_fifo": fifo.request_fifo,

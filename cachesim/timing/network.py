@@ -2,7 +2,8 @@
 
 "input-fifo" is a crossbar that matches the heads of its inputs to outputs once a cycle, each output
 taking the next input in turn (iSLIP with one iteration); a head whose output is taken blocks what
-is behind it. "output-queued" has no such blocking: a packet waits at its output.
+is behind it, and a packet holds its output for whole cycles. "output-queued" has no such blocking:
+a packet waits at its output, which moves a flit's bytes a cycle, several small packets if they fit.
 """
 
 from __future__ import annotations
@@ -20,7 +21,8 @@ class Network(NamedTuple):
 
     inputs: (I,) `records.PORT`, in_ring: (I, room) int32, in_time: (I, room) int64 cycle from which
     a packet may move; in_out: (I, room) int32 its output, in_flits: (I, room) int32.
-    outputs: (O,) `records.OUTLET`, out_ring, out_time: (O, room). wake: (O,) int64, when the
+    outputs: (O,) `records.OUTLET`, out_ring, out_time: (O, room); an output-queued one's `busy` is
+    in 1/256 cycles. wake: (O,) int64, when the
     receiver has something to take. scalars: (4,) int64, packets held at inputs, the latency,
     packets in all, cycles with a blocked head.
     """
@@ -50,18 +52,18 @@ def has_room(machine, net, source, output):  # type: ignore[no-untyped-def]
 @compiled
 def push(machine, net, source, output, request, payload_bytes, time):  # type: ignore[no-untyped-def]
     """Enter a packet that may move from cycle `time` on."""
-    flits = (payload_bytes + machine.header_bytes + machine.flit_bytes - 1) // machine.flit_bytes
+    size = payload_bytes + machine.header_bytes
     net.scalars[PACKETS] += 1
     if machine.output_queued:
         outlet = net.outputs[output]
         room = net.out_ring.shape[1] - 1
-        start = max(time, outlet.busy)
-        outlet.busy = start + flits
+        outlet.busy = max(time * 256, outlet.busy) + max(1, size * 256 // machine.flit_bytes)
         at = (outlet.head + outlet.count) & room
         net.out_ring[output, at] = request
-        net.out_time[output, at] = start + flits + net.scalars[LATENCY]
+        net.out_time[output, at] = (outlet.busy + 255) // 256 + net.scalars[LATENCY]
         outlet.count += 1
         return
+    flits = (size + machine.flit_bytes - 1) // machine.flit_bytes
     port = net.inputs[source]
     room = net.in_ring.shape[1] - 1
     at = (port.in_head + port.in_count) & room

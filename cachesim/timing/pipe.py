@@ -2,7 +2,10 @@
 registers.
 
 memory instruction ──► L1 banks (a delay, then the tags) ──► miss queue ──► interconnect
-registers ◄── write-back, one sector a cycle ◄── fill ◄── responses
+registers ◄── write-back ◄── fill ◄── responses
+
+How many sectors each of these moves a cycle follows from the ports' widths (`machine.build`); it is
+one in GPGPU-Sim.
 """
 
 from __future__ import annotations
@@ -89,7 +92,9 @@ def _returned(state, request):  # type: ignore[no-untyped-def]
 
 @compiled
 def _write_back(state, unit):  # type: ignore[no-untyped-def]
-    """Write one sector to the registers, and choose the next client: texture, bypassed or L1."""
+    """Write one sector to the registers, and choose the next client: texture, bypassed or L1.
+    Returns whether there is one.
+    """
     machine = state.pool.machine[0]
     pipe = state.pipes[unit]
     if pipe.next_writeback >= 0:
@@ -108,16 +113,19 @@ def _write_back(state, unit):  # type: ignore[no-untyped-def]
             pipe.next_writeback = next_ready(state.l1, state.pool.requests, unit)
         if pipe.next_writeback >= 0:
             pipe.client = (client + 1) % 5
-            return
+            return True
+    return False
 
 
 @compiled
 def _respond(state, unit):  # type: ignore[no-untyped-def]
-    """Take one reply: an acknowledged store, bypassed data, or data for the L1."""
+    """Take one reply: an acknowledged store, bypassed data, or data for the L1. Returns whether it
+    could.
+    """
     machine = state.pool.machine[0]
     pipe = state.pipes[unit]
     if pipe.response_count == 0:
-        return
+        return False
     room = state.responses.shape[1] - 1
     request = state.responses[unit, pipe.response_head & room]
     one = state.pool.requests[request]
@@ -127,32 +135,35 @@ def _respond(state, unit):  # type: ignore[no-untyped-def]
         drop_request(state.pool, request)
     elif one.path == PATH_BYPASS:
         if pipe.next_global >= 0:
-            return
+            return False
         pipe.next_global = request
     elif one.path == PATH_FIFO:
         fifo.arrived(state, unit, request)
     else:
         node = state.l1.nodes[unit]
-        if node.fill_time > machine.now * 256:
-            return
+        if node.fill_time >= (machine.now + 1) * 256:
+            return False
         node.fill_time = max(node.fill_time, machine.now * 256) + state.l1.level[0].fill_cost
         fill(state.l1, state.pool, unit, request, machine.now)
     pipe.response_head = (pipe.response_head + 1) & room
     pipe.response_count -= 1
+    return True
 
 
 @compiled
 def _drain_misses(state, unit):  # type: ignore[no-untyped-def]
-    """Send the oldest miss on."""
+    """Send the oldest miss on. Returns whether it could."""
     node = state.l1.nodes[unit]
     if node.miss_count == 0:
-        return
+        return False
     room = state.l1.queues.shape[2] - 1
     request = state.l1.queues[unit, MISSES, node.miss_head & room]
-    if send_up(state, request):
-        node.miss_head = (node.miss_head + 1) & room
-        node.miss_count -= 1
-        node.version += 1
+    if not send_up(state, request):
+        return False
+    node.miss_head = (node.miss_head + 1) & room
+    node.miss_count -= 1
+    node.version += 1
+    return True
 
 
 @compiled
@@ -163,6 +174,7 @@ def _look_up(state, unit):  # type: ignore[no-untyped-def]
     node = state.l1.nodes[unit]
     room = state.banks.shape[1] - 1
     now = machine.now
+    # Where `lines_per_cycle` rules, "bank" k is the k-th access that entered in a cycle.
     for bank in range(machine.num_banks):
         if pipe.bank_count[bank] == 0:
             continue
@@ -235,9 +247,18 @@ def _highest(mask):  # type: ignore[no-untyped-def]
 
 
 @compiled
+def _out_of_bandwidth(pipe):  # type: ignore[no-untyped-def]
+    """Note why the instruction is not done, and that it is not."""
+    if pipe.blocked == 0:
+        pipe.blocked = R_L1_BANDWIDTH
+    return False
+
+
+@compiled
 def _issue_accesses(state, unit):  # type: ignore[no-untyped-def]
     """Hand sectors of the instruction at hand to the L1's banks, or around it, from the highest
-    address down; a bank clash ends the cycle. Returns whether the instruction is done.
+    address down; a bank clash ends the cycle, or the next line where `lines_per_cycle` have been
+    looked up. Returns whether the instruction is done.
     """
     machine = state.pool.machine[0]
     pipe = state.pipes[unit]
@@ -245,9 +266,14 @@ def _issue_accesses(state, unit):  # type: ignore[no-untyped-def]
     room = state.banks.shape[1] - 1
     level = state.l1.level[0]
     now = machine.now
-    moves = 1 if pipe.path != 0 else machine.num_banks
-    for _ in range(moves):
+    moves = machine.sectors_per_cycle if pipe.path != 0 else machine.num_banks
+    lines = 0 if pipe.mask == 0 else 1
+    for k in range(moves):
         while pipe.mask == 0 and pipe.at > pipe.first:
+            if pipe.path == 0 and machine.lines_per_cycle > 0:
+                if lines == machine.lines_per_cycle:
+                    return _out_of_bandwidth(pipe)
+                lines += 1
             pipe.at -= 1
             pipe.mask = work.mask[pipe.at & machine.request_mask]
             if pipe.path != PATH_BYPASS:
@@ -278,11 +304,11 @@ def _issue_accesses(state, unit):  # type: ignore[no-untyped-def]
         else:
             bank = (address >> machine.bank_shift) & (machine.num_banks - 1)
             touch_address(state.l2_route, address)
+            if machine.lines_per_cycle > 0:
+                bank = k
             if pipe.bank_count[bank] >= machine.l1_latency or pipe.bank_entered[bank] == now:
                 machine.bank_conflicts += 1
-                if pipe.blocked == 0:
-                    pipe.blocked = R_L1_BANDWIDTH
-                return False
+                return _out_of_bandwidth(pipe)
             index = _new_request(state, unit, address, at, sector)
             state.pool.requests[index].ready = now + machine.l1_latency
             place = (pipe.bank_head[bank] + pipe.bank_count[bank]) & room
@@ -294,11 +320,7 @@ def _issue_accesses(state, unit):  # type: ignore[no-untyped-def]
             pipe.in_banks += 1
         pipe.mask &= ~(1 << sector)
         pipe.left -= 1
-    if pipe.left > 0:
-        if pipe.blocked == 0:
-            pipe.blocked = R_L1_BANDWIDTH
-        return False
-    return True
+    return pipe.left <= 0 or _out_of_bandwidth(pipe)
 
 
 @compiled
@@ -312,7 +334,8 @@ def _law_cycles(state, row, instruction):  # type: ignore[no-untyped-def]
         moved = row.lanes * instruction.access_bytes
         cycles = max(cycles, -(-moved // machine.bytes_per_cycle))
     if machine.quads_per_cycle > 0 and instruction.quad_cost > 0:
-        quads = -(-row.lanes // 4) * instruction.quad_cost
+        # The filters are the SM's; each of its units has an equal share.
+        quads = -(-row.lanes // 4) * instruction.quad_cost * machine.units
         cycles = max(cycles, -(-quads // machine.quads_per_cycle))
     return cycles
 
@@ -374,13 +397,20 @@ def step_pipe(state, index, unit):  # type: ignore[no-untyped-def]
     machine = state.pool.machine[0]
     pipe = state.pipes[unit]
     pipe.blocked = 0
-    _write_back(state, unit)
-    _respond(state, unit)
+    # A sector is chosen one cycle and written the next, so that a lone one takes two.
+    for _ in range(machine.returns_per_cycle if pipe.next_writeback >= 0 else 1):
+        if not _write_back(state, unit):
+            break
+    for _ in range(machine.sectors_per_cycle):
+        if not _respond(state, unit):
+            break
     if machine.has_fifo_l1:
         if pipe.request_count > 0 and send_up(state, fifo.oldest_request(state, unit)):
             fifo.request_sent(state, unit)
         fifo.step(state, unit)
-    _drain_misses(state, unit)
+    for _ in range(machine.sectors_per_cycle):
+        if not _drain_misses(state, unit):
+            break
     if pipe.in_banks > 0:
         _look_up(state, unit)
     if pipe.warp >= 0 and _issue_accesses(state, unit):

@@ -379,7 +379,8 @@ MACHINE = np.dtype(
             "num_lane_fetches", "bank_conflicts", "instruction_threads", "has_gl1", "has_llc",
             "error", "ctas_done", "trailer_first", "trailer_last", "icnt_busy", "queued_dram",
             "dram_reads", "dram_writes", "row_hits", "activates", "precharges",
-            "store_bytes", "line_parts",
+            "store_bytes", "line_parts", "sectors_per_cycle", "returns_per_cycle",
+            "replies_per_cycle",
         )
     ]
 )  # fmt: skip

@@ -6,6 +6,7 @@ import numpy as np
 
 from cachesim.compiled import compiled
 from cachesim.stream import STORE
+from cachesim.timing.bits import bit_at, lowest, without_lowest
 from cachesim.timing.pipe import step_pipe
 from cachesim.timing.records import (
     CONTROL,
@@ -39,25 +40,22 @@ def _pick(state, index, scheduler, candidates):  # type: ignore[no-untyped-def]
     machine = state.pool.machine[0]
     sm = state.sms[index]
     last = sm.last_issued[scheduler]
-    step = machine.num_schedulers
     if machine.is_gto:
         if last >= 0 and (candidates >> U64(last)) & U64(1):
             return last
         best, age = -1, NEVER
-        for slot in range(scheduler, MAX_WARPS, step):
-            if (candidates >> U64(slot)) & U64(1):
-                one = state.warps[index * MAX_WARPS + slot].age
-                if one < age:
-                    best, age = slot, one
+        while candidates != 0:
+            slot = lowest(candidates)
+            candidates = without_lowest(candidates)
+            one = state.warps[index * MAX_WARPS + slot].age
+            if one < age:
+                best, age = slot, one
         return best
-    first = last + step if last >= 0 else scheduler
-    for slot in range(first, MAX_WARPS, step):
-        if (candidates >> U64(slot)) & U64(1):
-            return slot
-    for slot in range(scheduler, first, step):
-        if (candidates >> U64(slot)) & U64(1):
-            return slot
-    return -1
+    # The next after the last one, or the first.
+    after = candidates & ~(bit_at(last + 1) - U64(1)) if 0 <= last < 63 else candidates
+    if last == 63 or after == 0:
+        after = candidates
+    return lowest(after)
 
 
 @compiled
@@ -381,9 +379,14 @@ def step_sm(state, index):  # type: ignore[no-untyped-def]
         _collect(state, index)
     issued = 0
     if sm.num_resident > 0:
-        for s in range(machine.num_schedulers):
-            scheduler = (s + now) % machine.num_schedulers
-            issued += _issue(state, index, scheduler)
+        ready = sm.ready[0] | sm.ready[1] | sm.ready[2] | sm.ready[3] | sm.ready[4]
+        scheduler = now % machine.num_schedulers
+        for _ in range(machine.num_schedulers):
+            if ready & state.scheduler_masks[scheduler]:
+                issued += _issue(state, index, scheduler)
+            scheduler += 1
+            if scheduler == machine.num_schedulers:
+                scheduler = 0
     if issued > 0:
         reason = R_ISSUE
     elif sm.num_resident == 0:

@@ -11,6 +11,7 @@ import numpy as np
 
 from cachesim.compiled import compiled
 from cachesim.stream import STORE
+from cachesim.timing.bits import bit_at, lowest, without_lowest
 from cachesim.timing.records import MAX_LOADS, MAX_WARPS, MEMORY, NEVER, WAIT, WHEEL
 
 
@@ -130,20 +131,18 @@ def wake_timed(state, index):  # type: ignore[no-untyped-def]
     if due == 0:
         return
     sm.wheel[machine.now & (WHEEL - 1)] = np.uint64(0)
-    slot = 0
     while due != 0:
-        if due & np.uint64(1):
-            sm.num_timed -= 1
-            warp = state.warps[index * MAX_WARPS + slot]
-            kind = MEMORY
-            if warp.operation < warp.last_operation:
-                kind = state.work.operations[warp.operation].kind
-            if has_exited(warp):
-                schedule(state, index, slot, machine.now)
-            else:
-                sm.ready[kind] |= np.uint64(1) << np.uint64(slot)
-        due >>= np.uint64(1)
-        slot += 1
+        slot = lowest(due)
+        due = without_lowest(due)
+        sm.num_timed -= 1
+        warp = state.warps[index * MAX_WARPS + slot]
+        kind = MEMORY
+        if warp.operation < warp.last_operation:
+            kind = state.work.operations[warp.operation].kind
+        if has_exited(warp):
+            schedule(state, index, slot, machine.now)
+        else:
+            sm.ready[kind] |= bit_at(slot)
 
 
 @compiled
