@@ -19,7 +19,7 @@ def compile_loops(*, lane_address: bool = False, timing: bool = False) -> None:
     lane_address: for traces of byte addresses, whose loops are compiled apart. timing: the clocked
         machine instead of the counting one, about 20 s.
     """
-    trace = stream(1, 1) if lane_address else pixel_pass(Texture("t", "RGBA16F", 8, 8), "store")
+    trace = stream(8, 1) if lane_address else pixel_pass(Texture("t", "RGBA16F", 8, 8), "store")
     # The clock's loops are the same for every machine.
     for name in _PRESETS[:1] if timing else _PRESETS:
         simulate(trace, name, threaded=False, timing=timing)

@@ -25,7 +25,7 @@ def _trailing_zeros(typingctx: Any, mask: Any) -> Any:
 @compiled
 def lowest(mask):  # type: ignore[no-untyped-def]
     """Place of the lowest bit that is set; `mask` is not 0."""
-    return _trailing_zeros(mask)
+    return _trailing_zeros(mask)  # type: ignore[call-arg]
 
 
 @compiled

@@ -147,6 +147,8 @@ class Clock:
         machine.forget_lines(self.state.l1)
         if self._gpu.gl1 is not None:
             machine.forget_lines(self.state.gl1)
+        if self._timeline is not None:
+            self._show_launch(launch, self._before.now, self.launches[-1])
         self._launch = -1
 
     def _show_launch(self, launch: Launch, start: int, done: PassTiming) -> None:
@@ -229,6 +231,23 @@ class Clock:
             ):
                 if ports[count].sum():
                     found.append(f"{name} {side} {int(ports[count].sum())}")
+        pipes = state.pipes
+        for name, counts in (
+            ("l1 banks", pipes["in_banks"]),
+            ("texture fragments", pipes["fragment_count"]),
+            ("texture requests", pipes["request_count"]),
+            ("memory instructions", state.sms["queue_count"].sum(axis=1)),
+            ("replies at SMs", state.sms["eject_count"]),
+            ("load/store responses", pipes["response_count"]),
+        ):
+            if counts.sum():
+                found.append(f"{name} {int(counts.sum())} (instance {int(counts.argmax())})")
+        channels = state.memory.channels
+        held = channels["pending"] + channels["num_serving"]
+        for part in ("latency", "entry", "data", "return"):
+            held = held + channels[f"{part}_count"]
+        if held.sum():
+            found.append(f"dram {int(held.sum())} (channel {int(held.argmax())})")
         blocked = int(state.sms["num_blocked"].sum())
         return f"cycle {self.cycles}, {blocked} warps wait; " + (
             "; ".join(found) or "all queues empty"
