@@ -334,7 +334,9 @@ def access(tags, pool, node, request, now):  # type: ignore[no-untyped-def]
         outcome, sent = _write(tags, pool, node, request, now)
     else:
         outcome = _read(tags, pool, node, request, now)
-        if operation == ATOMIC and outcome == HIT:
+        if operation == ATOMIC and outcome != FAIL:
+            # It is resolved here: below, its sector is only read.
+            pool.requests[request].operation = LOAD
             level = tags.level[0]
             address = pool.requests[request].address
             line = find_line(tags, node, address >> level.line_shift)
@@ -392,11 +394,6 @@ def fill(tags, pool, node, request, now):  # type: ignore[no-untyped-def]
         one = tags.lines[line]
         one.valid |= bit
         one.partial &= ~bit
-        if one_request.operation == ATOMIC:
-            if one.modified == 0:
-                tags.nodes[node].dirty_lines += 1
-            one.modified |= bit
-            tags.owner[line * level.sectors_per_line + sector] = one_request.group
     mark_ready(tags, node, address >> level.sector_shift)
     tags.nodes[node].version += 1
 

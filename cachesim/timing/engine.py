@@ -202,6 +202,7 @@ def _receive_requests(state, node):  # type: ignore[no-untyped-def]
         one = state.pool.requests[request]
         delay = level.texture_latency if one.path == PATH_FIFO else level.latency
         if machine.line_parts > 1:
+            one.pending = machine.line_parts
             for part in range(machine.line_parts):
                 piece = _split(state, request, part, machine.l2_sector_shift)
                 if one.write:

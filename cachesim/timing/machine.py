@@ -104,6 +104,11 @@ def check_timing(gpu: Gpu, fetch_path: str) -> None:
                 f"{gpu.name}: {name}.replacement = {level.replacement!r}: timing allows lru, fifo"
             )
         timing = getattr(gpu, f"{name}_timing")
+        if level is not None and timing.miss_queue < 2:
+            raise InputError(
+                f"{gpu.name}: {name}_timing.miss_queue = {timing.miss_queue}: timing needs 2 or "
+                "more, as a read keeps one entry for a write-back"
+            )
         if level is not None and timing.allocation != "on-miss":
             if level.write_policy == "write-back":
                 raise InputError(
@@ -235,7 +240,7 @@ def forget_lines(tags: Tags) -> None:
     """Empty every line of a level."""
     ways = int(tags.level[0]["ways"])
     line = np.arange(len(tags.lines), dtype=np.int32)
-    tags.lines["key"] = -1
+    tags.lines["key"] = -NEVER
     tags.lines["set"] = line // ways
     # Way 0 is the first to be given up.
     tags.lines["newer"] = np.where(line % ways == ways - 1, -1, line + 1)

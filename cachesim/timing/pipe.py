@@ -35,6 +35,7 @@ from cachesim.timing.tags import next_ready
 from cachesim.timing.warp import sector_back, store_done
 
 U64 = np.uint64
+MAX_ADDRESS = (1 << 63) - 1
 
 
 @compiled
@@ -136,6 +137,11 @@ def _respond(state, unit):  # type: ignore[no-untyped-def]
     elif one.path == PATH_BYPASS:
         if pipe.next_global >= 0:
             return False
+        if one.parent >= 0:
+            parent = one.parent
+            drop_request(state.pool, request)
+            state.pool.requests[parent].pending -= 1
+            request = parent if state.pool.requests[parent].pending == 0 else -1
         pipe.next_global = request
     elif one.path == PATH_FIFO:
         fifo.arrived(state, unit, request)
@@ -282,7 +288,9 @@ def _issue_accesses(state, unit):  # type: ignore[no-untyped-def]
             break
         at = pipe.at & machine.request_mask
         sector = _highest(pipe.mask)
+        # The highest address bit is dropped: the engine's addresses are signed.
         address = (work.line[at] << level.line_shift) + (sector << level.sector_shift)
+        address &= MAX_ADDRESS
         if pipe.path == PATH_BYPASS:
             where, _number = locate(state.l2_route, address)
             source = unit // machine.units
@@ -386,7 +394,9 @@ def _take_instruction(state, index, unit):  # type: ignore[no-untyped-def]
         pipe.path = PATH_BYPASS
     pipe.free_at = now + _law_cycles(state, row, instruction)
     state.moved[0] += row.sectors << state.l1.level[0].sector_shift
-    if row.sectors == 0 and instruction.operation != STORE:
+    if row.sectors == 0 and instruction.operation == STORE:
+        store_done(state, pipe.warp)
+    elif row.sectors == 0:
         # A fully masked access asks for nothing; `issue` left one sector pending for it.
         sector_back(state, pipe.warp, pipe.load)
 

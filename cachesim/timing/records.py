@@ -78,7 +78,7 @@ REQUEST = np.dtype(
 
 LINE = np.dtype(
     [
-        ("key", "i8"),  # address >> line shift, -1 = never used
+        ("key", "i8"),  # address >> line shift, -NEVER = never used
         ("chain", "i4"),  # next line of its hash bucket
         ("newer", "i4"),  # neighbours in its set's order of use
         ("older", "i4"),

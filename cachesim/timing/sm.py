@@ -67,7 +67,7 @@ def _note_access(state, warp, row):  # type: ignore[no-untyped-def]
     instruction = state.work.instructions[row.code]
     if instruction.operation == STORE:
         parts = machine.line_parts if instruction.path == PATH_BYPASS else 1
-        warp.stores += row.sectors * parts
+        warp.stores += max(1, row.sectors * parts)
         return 0
     load = warp.next_load
     warp.pending[load & (MAX_LOADS - 1)] = max(1, row.sectors)
@@ -388,6 +388,7 @@ def step_sm(state, index):  # type: ignore[no-untyped-def]
             if scheduler == machine.num_schedulers:
                 scheduler = 0
     if issued > 0:
+        machine.progress = now
         reason = R_ISSUE
     elif sm.num_resident == 0:
         reason = R_IDLE

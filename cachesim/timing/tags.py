@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from cachesim.address import index_of
 from cachesim.compiled import compiled
+from cachesim.timing.records import NEVER
 
 
 class Tags(NamedTuple):
@@ -113,7 +114,7 @@ def install(tags, node, line, key):  # type: ignore[no-untyped-def]
     lines, buckets = tags.lines, tags.buckets
     one = lines[line]
     base = node * (mask + 1)
-    if one.key >= 0:
+    if one.key != -NEVER:
         bucket = base + (spread(one.key) & mask)
         if buckets[bucket] == line:
             buckets[bucket] = one.chain
