@@ -235,7 +235,8 @@ def _fetch_for_store(tags, pool, node, request, line, bit, now):  # type: ignore
     fetch.port = source.port
     fetch.group = source.group
     fetch.warp = -1
-    fetch.load = 0
+    # Whose fetch it is: the levels below answer it like any other.
+    fetch.load = level.index
     fetch.operation = LOAD
     fetch.write = 0
     fetch.kind = WRITE_FILL
@@ -381,7 +382,7 @@ def fill(tags, pool, node, request, now):  # type: ignore[no-untyped-def]
     sector = (address >> level.sector_shift) & level.sector_mask
     bit = 1 << sector
     line = find_line(tags, node, key)
-    if level.on_miss_allocation:
+    if line >= 0 and tags.lines[line].reserved & bit:
         one = tags.lines[line]
         one.reserved &= ~bit
         if one.reserved == 0:

@@ -162,6 +162,7 @@ SM = np.dtype(
         ("num_blocked", "i8"),
         ("resident_since", "i8"),
         ("ready", "u8", (5,)),
+        ("age", "i8", (MAX_WARPS,)),  # of the warp in each slot, the oldest least
         ("last_issued", "i4", (MAX_SCHEDULERS,)),
         ("parked", "i4", (MAX_SCHEDULERS,)),
         ("parked_kind", "i4", (MAX_SCHEDULERS,)),
@@ -252,7 +253,6 @@ WARP = np.dtype(
         ("stores", "i4"),
         ("cta", "i4"),  # place
         ("alive", "i4"),
-        ("age", "i8"),
         ("int_ready", "i8"),
         ("exit_ready", "i8"),  # when its exit has left the pipeline
         ("chains_ready", "i8", (3,)),

@@ -65,7 +65,8 @@ def _take_ready(tags, pool, node, now):  # type: ignore[no-untyped-def]
     if home.ready_first < 0 or home.out_count >= level.queue_out:
         return False
     request = next_ready(tags, pool.requests, node)
-    if pool.requests[request].kind == WRITE_FILL:
+    one = pool.requests[request]
+    if one.kind == WRITE_FILL and one.load == level.index:
         drop_request(pool, request)
     else:
         _answer(tags, pool, node, request)
@@ -81,7 +82,8 @@ def _take_fill(tags, pool, node, now):  # type: ignore[no-untyped-def]
         return False
     request = _front(tags, node, FILLS, home.fill_head)
     one = pool.requests[request]
-    passes = one.write or (level.is_read_only and one.path == 1)
+    went_around = one.operation == ATOMIC and level.on_hit != HIT_BACK
+    passes = one.write or went_around or (level.is_read_only and one.path == 1)
     if passes:
         if home.out_count >= level.queue_out:
             return False

@@ -47,9 +47,8 @@ def _pick(state, index, scheduler, candidates):  # type: ignore[no-untyped-def]
         while candidates != 0:
             slot = lowest(candidates)
             candidates = without_lowest(candidates)
-            one = state.warps[index * MAX_WARPS + slot].age
-            if one < age:
-                best, age = slot, one
+            if sm.age[slot] < age:
+                best, age = slot, sm.age[slot]
         return best
     # The next after the last one, or the first.
     after = candidates & ~(bit_at(last + 1) - U64(1)) if 0 <= last < 63 else candidates

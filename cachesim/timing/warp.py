@@ -228,7 +228,7 @@ def start_warp(state, index, slot, place, first, rows, age):  # type: ignore[no-
     warp.stores = 0
     warp.cta = place
     warp.alive = 1
-    warp.age = age
+    sm.age[slot] = age
     warp.int_ready = 0
     warp.exit_ready = 0
     for chain in range(3):
