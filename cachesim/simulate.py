@@ -112,6 +112,8 @@ def simulate_all(
 
 def _report(trace: Trace, gpu: Gpu, model: Stages | Clock) -> Report:
     """The checked report of a finished model."""
+    if isinstance(model, Clock):
+        model.drain()
     levels = model.counted_levels()
     parts = []
     for pair, (pass_name, texture) in enumerate(model.pairs):

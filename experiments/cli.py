@@ -24,6 +24,7 @@ from experiments import (
     import_config,
     info,
     layouts,
+    microbench,
     p4000_times,
     prefilter,
     presets,
@@ -32,6 +33,7 @@ from experiments import (
     run,
     sensitivity,
     sweep,
+    validate,
 )
 from traces.errors import InputError, WorkError
 
@@ -55,6 +57,7 @@ for module in (
     run,
     sweep,
     sensitivity,
+    microbench,
     bound,
     presets,
     layouts,
@@ -67,6 +70,7 @@ for module in (
     doctor,
 ):
     app.command(module.__name__.rpartition(".")[2].replace("_", "-"))(module.command)
+app.add_typer(validate.app)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -98,13 +98,18 @@ class Case:
 
 
 def list_cases(
-    scenes: Sequence[str] = SCENES, methods: Sequence[str] = tuple(METHODS)
+    scenes: Sequence[str] = SCENES,
+    methods: Sequence[str] = tuple(METHODS),
+    scales: Sequence[str] = SCALES,
+    plane_sets: Sequence[str] = tuple(PLANE_SETS),
 ) -> list[Case]:
-    """The cases of these scenes and methods, the paper's own comparison first."""
+    """The cases of these names, the paper's own comparison first."""
     return [
         Case(scene, scale, planes, method)
         for scale in SCALES
+        if scale in scales
         for planes in PLANE_SETS
+        if planes in plane_sets
         for method in METHODS
         if method in methods
         for scene in SCENES

@@ -15,8 +15,8 @@ if TYPE_CHECKING:
 
 QUICK_SIZE = "480x270"
 ONLY_HELP = (
-    "Only these: scenes close, ear, front and methods fixed, adaptive, baseline, forced-8, "
-    "forced-16, forced-32."
+    "Only these: scenes close, ear, front; methods fixed, adaptive, baseline, forced-8, forced-16, "
+    "forced-32; scales legacy, physical; planes all, irradiance."
 )
 
 
@@ -47,7 +47,16 @@ def command(
     from experiments import p4000_cases
 
     width, height = parse_image_size(size or (QUICK_SIZE if quick else p4000_cases.PUBLISHED_SIZE))
-    scenes, methods = select(only, p4000_cases.SCENES, tuple(p4000_cases.METHODS))
+    chosen = select(
+        only,
+        (
+            p4000_cases.SCENES,
+            tuple(p4000_cases.METHODS),
+            p4000_cases.SCALES,
+            tuple(p4000_cases.PLANE_SETS),
+        ),
+    )
+    scenes = chosen[0]
     from cachesim import presets
     from cachesim.first_use import compile_loops
 
@@ -69,7 +78,7 @@ def command(
             write_counts(case, counts, folder)
 
         cells = study.run_cases(
-            p4000_cases.list_cases(scenes, methods),
+            p4000_cases.list_cases(*chosen),
             gbuffers,
             machine,
             kept,
@@ -81,22 +90,20 @@ def command(
     write_results(cells, machine.name, f"{width}x{height}", folder)
 
 
-def select(
-    only: str | None, scenes: tuple[str, ...], methods: tuple[str, ...]
-) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """The scenes and methods that a list names; all of a kind of which it names none.
+def select(only: str | None, kinds: tuple[tuple[str, ...], ...]) -> tuple[tuple[str, ...], ...]:
+    """Of each kind the names that a list names; all of a kind of which it names none.
 
     Raises:
-        InputError: a name that is neither.
+        InputError: a name of no kind.
     """
     from traces.errors import unknown
 
     names = parse_names(only, "--only") if only is not None else []
+    known = tuple(name for kind in kinds for name in kind)
     for name in names:
-        if name not in scenes + methods:
-            raise unknown("scene or method", name, scenes + methods, "--only")
-    chosen_scenes = tuple(s for s in scenes if s in names) or scenes
-    return chosen_scenes, tuple(m for m in methods if m in names) or methods
+        if name not in known:
+            raise unknown("scene, method, scale or plane set", name, known, "--only")
+    return tuple(tuple(n for n in kind if n in names) or kind for kind in kinds)
 
 
 def write_counts(case: Case, counts: Counts, folder: Path) -> None:

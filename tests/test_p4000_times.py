@@ -95,11 +95,11 @@ def test_the_baseline_reads_mip_0_alone_and_plane_sets_change_what_is_read_not_h
 
 def test_only_selects_scenes_and_methods_by_name():
     methods = tuple(METHODS)
-    assert select(None, SCENES, methods) == (SCENES, methods)
-    assert select("front", SCENES, methods) == (("front",), methods)
-    assert select("adaptive,ear,fixed", SCENES, methods) == (("ear",), ("fixed", "adaptive"))
+    assert select(None, (SCENES, methods)) == (SCENES, methods)
+    assert select("front", (SCENES, methods)) == (("front",), methods)
+    assert select("adaptive,ear,fixed", (SCENES, methods)) == (("ear",), ("fixed", "adaptive"))
     with pytest.raises(InputError, match=r"--only.*'fronts'.*did you mean 'front'"):
-        select("fronts", SCENES, methods)
+        select("fronts", (SCENES, methods))
 
 
 @pytest.fixture

@@ -4,12 +4,19 @@ import re
 from math import ceil
 from pathlib import Path
 
+import numpy as np
 import pytest
 from pydantic import BaseModel
 
-from cachesim import presets
+from cachesim import presets, simulate
 from cachesim.config import Gpu
 from cachesim.timing_config import CacheTiming, DramTiming, Icnt, L1Timing, L2Timing, SmTiming
+from experiments.microbench import bandwidth_of, latency_of
+from traces.lane_address import lane_address_trace
+from traces.synthetic import gather
+from traces.texture import Texture
+
+BASE = 0x7F40_0000_0000
 
 #: Published peak of the memory (makers' specifications): GB/s, and its size in GiB.
 MEMORY = {
@@ -201,6 +208,7 @@ def test_queues_hold_what_their_latency_keeps_in_flight(name: str) -> None:
 def unloaded_latencies(name: str) -> dict[str, int]:
     """Core cycles of a lone load that hits each level: the tables' latencies and the pipeline's own
     stages (one cycle each to leave the miss queue, cross a network, look up, answer; two to fill).
+    In the memory another row is open.
     """
     gpu = presets.load(name)
     sm, l1, l2, icnt, dram = (
@@ -213,12 +221,14 @@ def unloaded_latencies(name: str) -> dict[str, int]:
         + l2.latency_cycles
     )  # fmt: skip
     if gpu.gl1_timing:
-        totals["gl1"] = totals["l1"] + 7 + gpu.gl1_timing.latency_cycles
-        totals["l2"] += gpu.gl1_timing.latency_cycles + 6
+        totals["gl1"] = totals["l1"] + 6 + gpu.gl1_timing.latency_cycles
+        totals["l2"] += gpu.gl1_timing.latency_cycles + 4
     last = totals["l2"]
     if gpu.llc_timing:
-        last = totals["llc"] = totals["l2"] + 4 + gpu.llc_timing.latency_cycles
-    commands = (dram.rcd + dram.cl + 6) * gpu.clock_hz / dram.clock_hz
+        last = totals["llc"] = totals["l2"] + 5 + gpu.llc_timing.latency_cycles
+    # The bursts of one sector follow each other in one bank.
+    more = ((gpu.llc or gpu.l2).sector_bytes // dram.atom_bytes - 1) * dram.ccdl
+    commands = (dram.rp + dram.rcd + dram.cl + more + 4) * gpu.clock_hz / dram.clock_hz
     totals["dram"] = last + dram.fixed_latency_cycles + round(commands)
     return totals
 
@@ -244,6 +254,120 @@ def test_memory_is_150_ns_beyond_the_last_cache_of_an_amd_card(name: str, clock_
     totals = unloaded_latencies(name)
     beyond = totals["dram"] - totals.get("llc", totals["l2"])
     assert beyond / clock_hz == pytest.approx(150e-9, rel=0.02)
+
+
+# ---- on the machine itself
+
+
+@every_preset
+def test_a_chase_takes_the_sum_of_the_stages_at_every_level(name: str) -> None:
+    gpu = presets.load(name)
+    for level, total in unloaded_latencies(name).items():
+        # A memory access waits for the edge of its clock, and may find its row open.
+        allowed = 0.02 * total if level == "dram" else 0.01
+        assert latency_of(gpu, level, 100) == pytest.approx(total, abs=allowed), level
+
+
+def test_a_chase_on_navi_21_reads_what_silicon_does() -> None:
+    gpu = presets.load("rx-6900-xt")
+    for level, cycles in {"l1": 73, "gl1": 123, "l2": 220, "llc": 415}.items():
+        assert latency_of(gpu, level, 100) == pytest.approx(cycles, rel=0.05), level
+
+
+@pytest.mark.parametrize(
+    ("level", "measured"),
+    [
+        ("l1", 128),  # a warp's whole line a cycle and CU
+        ("l2", 4.65e12 / 2.57e9),
+        ("llc", 1.95e12 / 2.015e9),
+        ("dram", 475e9 / 2.015e9),  # reads of 450 to 500 GB/s
+    ],
+)
+def test_a_stream_on_navi_21_reaches_what_silicon_does(level: str, measured: float) -> None:
+    gpu = presets.load("rx-6900-xt")
+    assert bandwidth_of(gpu, level) == pytest.approx(measured, rel=0.1)
+
+
+def test_a_gl1_gives_its_four_banks_bandwidth() -> None:
+    for name in ("rx-5700-xt", "rx-6900-xt"):
+        assert bandwidth_of(presets.load(name), "gl1") == pytest.approx(256, rel=0.05)
+
+
+@pytest.mark.parametrize(("stride", "bytes_per_cycle"), [(1, 128), (2, 64), (4, 32), (8, 16)])
+def test_strided_loads_share_navi_21s_one_line_a_cycle(stride: int, bytes_per_cycle: int) -> None:
+    """gpu-benches, RX 6900 XT: lanes `stride` floats apart."""
+    gpu = presets.load("rx-6900-xt", ["sm.count=1"])
+    loads, warps = 256, gpu.sm.max_warps
+    # The warps start at the same 8 lines and stay in 8 KiB.
+    line = np.arange(loads)[:, None] * stride % 64
+    lanes = line * 128 + np.arange(32) * 4 * stride
+    trace = lane_address_trace(
+        np.tile((BASE + lanes).astype(np.uint64), (warps, 1, 1)),
+        warps_per_cta=8,
+        loads_in_flight=loads,
+        compute_per_load=0,
+        bytes_per_lane=4,
+    )
+    timing = simulate(trace, gpu, timing=True).timing
+    assert timing is not None
+    total = timing.total
+    rate = loads * warps * 128 / (total.cycles - total.launch_cycles)
+    start = unloaded_latencies("rx-6900-xt")["dram"] / (loads * warps * stride)
+    assert bytes_per_cycle * (1 - 1.5 * start) < rate <= bytes_per_cycle
+
+
+@pytest.mark.parametrize("name", sorted(set(MEMORY) - {"h100-sxm", "rx-6900-xt"}))
+def test_streams_reach_most_of_a_cards_peaks(name: str) -> None:
+    gpu = presets.load(name)
+    assert 0.8 < bandwidth_of(gpu, "l2") / L2_BYTES_PER_CYCLE[name] <= 1
+    peak = dram_bytes_per_second(gpu) / gpu.clock_hz
+    assert 0.8 < bandwidth_of(gpu, "dram") / peak <= 1
+
+
+@pytest.mark.parametrize(
+    ("name", "bytes_per_cycle"),
+    [("titan-x-pascal", 64), ("rtx-2060", 64), ("h100-sxm", 127)],
+)
+def test_an_sm_gets_the_published_bandwidth_out_of_its_l1(name: str, bytes_per_cycle: int) -> None:
+    assert bandwidth_of(presets.load(name), "l1") == pytest.approx(bytes_per_cycle, rel=0.05)
+
+
+@pytest.mark.parametrize("name", ["titan-x-pascal", "rtx-2060"])
+def test_four_lines_of_any_banks_enter_an_nvidia_l1_in_a_cycle(name: str) -> None:
+    """32 lanes in 32 lines take 8 cycles, wherever the lines lie."""
+    gpu = presets.load(name, ["sm.count=1"])
+    assert gpu.l1_timing is not None
+    loads, warps = 24, gpu.sm.max_warps
+    rng = np.random.default_rng(0)
+    lanes = (rng.permutation(32) * 128)[None, :] + rng.integers(0, 4, (loads, 32)) * 32
+    trace = lane_address_trace(
+        np.tile((BASE + lanes).astype(np.uint64), (warps, 1, 1)),
+        warps_per_cta=8,
+        loads_in_flight=loads,
+        compute_per_load=0,
+        bytes_per_lane=1,
+    )
+    timing = simulate(trace, gpu, timing=True).timing
+    assert timing is not None
+    cycles = timing.total.cycles - timing.total.launch_cycles
+    needed = loads * warps * 8 / gpu.l1.units_per_sm
+    assert needed <= cycles < 1.1 * needed + 3 * unloaded_latencies(name)["dram"]
+
+
+@pytest.mark.parametrize(("units", "quads"), [(1, 1), (1, 2), (2, 2)])
+def test_the_sms_filters_are_shared_by_its_l1_units(units: int, quads: int) -> None:
+    """An SM filters `texture_quads_per_cycle` quads a cycle, whatever it has of L1 units."""
+    gpu = presets.load(
+        "titan-x-pascal",
+        ["sm.count=1", f"l1.units_per_sm={units}", f"sm_timing.texture_quads_per_cycle={quads}"],
+    )
+    samples = 32
+    trace = gather(Texture("t", "RGBA8", 32, 32), 1, samples)
+    timing = simulate(trace, gpu, fetch_path="texture", timing=True).timing
+    assert timing is not None
+    cycles = timing.total.cycles - timing.total.launch_cycles
+    needed = 32 * 32 * samples / 4 / quads
+    assert needed <= cycles < needed + 3 * unloaded_latencies("titan-x-pascal")["dram"]
 
 
 # ---- the SM

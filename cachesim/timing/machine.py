@@ -125,6 +125,18 @@ def check_timing(gpu: Gpu, fetch_path: str) -> None:
             f"{gpu.name}: l1.write_policy = 'write-back': timing allows the policies that keep no "
             "dirty data in the L1"
         )
+    if gpu.l1.write_allocate in ("write-allocate", "fetch-on-write"):
+        raise InputError(
+            f"{gpu.name}: l1.write_allocate = {gpu.l1.write_allocate!r}: timing allows none, "
+            "lazy-fetch-on-read"
+        )
+    for name in ("l2", "llc"):
+        level = getattr(gpu, name)
+        if level is not None and level.write_policy != "write-back":
+            raise InputError(
+                f"{gpu.name}: {name}.write_policy = {level.write_policy!r}: timing allows "
+                "write-back"
+            )
     last = gpu.llc or gpu.l2
     if last.sector_bytes % gpu.dram_timing.atom_bytes:
         raise InputError(

@@ -396,9 +396,11 @@ def _take_instruction(state, index, unit):  # type: ignore[no-untyped-def]
     state.moved[0] += row.sectors << state.l1.level[0].sector_shift
     if row.sectors == 0 and instruction.operation == STORE:
         store_done(state, pipe.warp)
+        pipe.warp = -1
     elif row.sectors == 0:
         # A fully masked access asks for nothing; `issue` left one sector pending for it.
         sector_back(state, pipe.warp, pipe.load)
+        pipe.warp = -1
 
 
 @compiled

@@ -151,10 +151,10 @@ class TimingResult:
     @property
     def total(self) -> PassTiming:
         """All passes together; its name is "total"."""
-        whole = self.passes[0]
-        for one in self.passes[1:]:
+        whole = PassTiming("total", 0, 0, 0, dict.fromkeys(REASONS, 0), {}, 0, 0, 0, {})
+        for one in self.passes:
             whole = whole + one
-        return PassTiming(**{**whole.__dict__, "name": "total"})
+        return whole
 
     @property
     def time_ms(self) -> float:
