@@ -27,7 +27,8 @@ def correlation_figure(frame: pd.DataFrame) -> Figure:
     frame: as `validate_accel_sim.compare` returns it. Runs in which both counts are 0 have no
     place on these axes.
     """
-    figure = Figure(figsize=(8.4, 5.9), layout="constrained")
+    figure = Figure(figsize=(8.4, 6.1))
+    figure.set_layout_engine("constrained", hspace=0.06)
     configs = list(dict.fromkeys(frame["config"]))
     for axes, (name, label) in zip(figure.subplots(2, 3).flat, QUANTITIES.items(), strict=True):
         _panel(axes, frame, configs, name)

@@ -31,7 +31,6 @@ from cachesim.counts import (
 )
 from cachesim.stream import ATOMIC, LOAD, STORE
 from cachesim.timing.records import (
-    DEMANDED,
     FAIL,
     HIT,
     HIT_RESERVED,
@@ -397,6 +396,3 @@ def fill(tags, pool, node, request, now):  # type: ignore[no-untyped-def]
         one.partial &= ~bit
     mark_ready(tags, node, address >> level.sector_shift)
     tags.nodes[node].version += 1
-
-
-__all__ = ["DEMANDED", "access", "count_bypass", "drop_request", "fill", "push_miss"]

@@ -9,7 +9,6 @@ from __future__ import annotations
 import numpy as np
 
 from cachesim.compiled import compiled
-from cachesim.stream import LOAD
 from cachesim.timing.access import DOWN, drop_request
 from cachesim.timing.records import MAX_DRAM_BANKS, NEVER, WRITEBACK
 from cachesim.timing.slice import come_back
@@ -379,6 +378,3 @@ def next_delay(state, index):  # type: ignore[no-untyped-def]
         return NEVER
     room = state.memory.latency_ring.shape[1] - 1
     return state.memory.latency_time[index, channel.latency_head & room]
-
-
-__all__ = ["LOAD", "is_idle", "next_delay", "step_channel"]

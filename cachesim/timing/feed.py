@@ -14,9 +14,9 @@ from cachesim.coalesce import Placement, Program, coalesce, new_scratch
 from cachesim.config import Gpu
 from cachesim.counts import POPCOUNT
 from cachesim.dispatch import join_warps, resident_ctas
-from cachesim.stream import ATOMIC, LOAD, STORE, Requests
+from cachesim.stream import LOAD, STORE, Requests
 from cachesim.timing import records
-from cachesim.timing.records import CONTROL, KINDS, PATH_BYPASS, PATH_FIFO, PATH_L1, WAIT
+from cachesim.timing.records import CONTROL, KINDS, PATH_BYPASS, PATH_FIFO, PATH_L1
 from cachesim.timing.state import State, Work
 from traces.errors import InputError
 from traces.texture import INACTIVE_ADDRESS, INACTIVE_TEXEL
@@ -262,6 +262,3 @@ def _grown(ring: npt.NDArray[Any], tail: int, head: int, more: int) -> npt.NDArr
     kept = np.arange(tail, head)
     larger[kept & (size - 1)] = ring[kept & (len(ring) - 1)]
     return larger
-
-
-__all__ = ["ATOMIC", "WAIT", "Feed"]

@@ -429,6 +429,3 @@ def step_pipe(state, index, unit):  # type: ignore[no-untyped-def]
         pipe.warp = -1
     if pipe.warp < 0:
         _take_instruction(state, index, unit)
-
-
-__all__ = ["HIT", "inject", "send_up", "step_pipe"]

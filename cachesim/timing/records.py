@@ -146,7 +146,7 @@ LEVEL = np.dtype(
             "miss_queue", "bucket_mask", "mshr_mask", "port_cost", "fill_cost", "width",
             "latency", "texture_latency", "queue_in", "queue_down", "queue_fill", "queue_out",
             "reserve_in", "dirty_limit", "sectors_per_line", "is_read_only", "delay_capacity",
-            "miss_capacity", "index", "set_kind", "num_instances",
+            "index", "set_kind", "num_instances",
         )
     ]
 )  # fmt: skip
@@ -164,8 +164,6 @@ SM = np.dtype(
         ("ready", "u8", (5,)),
         ("age", "i8", (MAX_WARPS,)),  # of the warp in each slot, the oldest least
         ("last_issued", "i4", (MAX_SCHEDULERS,)),
-        ("parked", "i4", (MAX_SCHEDULERS,)),
-        ("parked_kind", "i4", (MAX_SCHEDULERS,)),
         ("unit_free", "i8", (MAX_SCHEDULERS, 4)),
         ("queue_head", "i4", (MAX_SCHEDULERS,)),
         ("queue_count", "i4", (MAX_SCHEDULERS,)),
@@ -193,7 +191,6 @@ SM = np.dtype(
         ("eject_head", "i4"),
         ("eject_count", "i4"),
         ("free_places", "i4"),
-        ("cta_wait", "i8"),
         ("wheel", "u8", (WHEEL,)),
     ],
     align=True,
@@ -224,7 +221,7 @@ PIPE = np.dtype(
         ("bank_write", "i4", (MAX_BANKS,)),  # whether the one that failed is a store
         ("in_banks", "i8"),
         ("blocked", "i4"),  # 0, or why nothing left the pipe this cycle
-        ("rob_head", "i4"),  # the texture FIFOs
+        # The texture FIFOs.
         ("rob_count", "i4"),
         ("fragment_count", "i4"),
         ("request_head", "i4"),
@@ -361,23 +358,22 @@ MACHINE = np.dtype(
             "int_on_fp32", "result_cycles", "memory_cycles", "memory_queue", "collector_units",
             "quads_per_cycle", "lines_per_cycle", "bytes_per_cycle", "num_banks", "bank_shift",
             "l1_latency", "bypass", "has_fifo_l1", "fragment_fifo", "request_fifo", "rob",
-            "result_fifo", "max_slots", "launch_cycles", "cta_launch_cycles", "ejection",
+            "result_fifo", "launch_cycles", "cta_launch_cycles", "ejection",
             "response", "num_ports", "num_slices", "num_gl1", "num_llc", "num_channels",
-            "sms_per_gl1", "subslices", "output_queued", "match_again", "request_latency",
-            "reply_latency", "flit_bytes", "header_bytes", "input_packets", "output_packets",
+            "sms_per_gl1", "subslices", "output_queued", "match_again", "flit_bytes",
+            "header_bytes", "input_packets", "output_packets",
             "l2_sector_shift", "core_hz", "dram_hz", "fixed_latency", "dram_queue",
             "return_queue", "dual_bus", "fr_fcfs", "num_dram_banks", "group_mask", "bursts",
             "ccd", "rrd", "rcd", "rcdwr", "ras", "rp", "rc", "cl", "wl", "rtw", "wtr", "wtp",
-            "rtp", "ccdl", "rtpl", "shared_credits", "llc_sector_shift", "last_level",
-            "unloaded_request", "unloaded_reply", "unloaded_dram", "channel_shift",
+            "rtp", "ccdl", "rtpl", "shared_credits", "llc_sector_shift", "channel_shift",
             "num_pool", "warps_per_cta", "num_places", "sector_shift",
             # state
             "now", "tick", "tick_remainder", "free_top", "queued", "taken", "complete",
-            "last_sm", "live_ctas", "warps_seen", "warps_total", "age", "row_mask",
-            "request_mask", "in_flight", "packets_up", "packets_down", "first_cta",
-            "place_from", "stuck_since", "progress", "num_rows",
+            "last_sm", "live_ctas", "age", "row_mask",
+            "request_mask", "in_flight",
+            "place_from", "progress", "num_rows",
             "num_lane_fetches", "bank_conflicts", "instruction_threads", "has_gl1", "has_llc",
-            "error", "ctas_done", "trailer_first", "trailer_last", "icnt_busy", "queued_dram",
+            "ctas_done", "trailer_first", "trailer_last", "queued_dram",
             "dram_reads", "dram_writes", "row_hits", "activates", "precharges",
             "store_bytes", "line_parts", "sectors_per_cycle", "returns_per_cycle",
             "replies_per_cycle",

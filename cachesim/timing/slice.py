@@ -27,7 +27,6 @@ from cachesim.timing.records import (
     DEMANDED,
     FAIL,
     HIT,
-    HIT_RESERVED,
     L2,
     NEVER,
     S_BELOW,
@@ -238,6 +237,3 @@ def step_cache(tags, pool, node, now):  # type: ignore[no-untyped-def]
         home.wake = max(now + 1, home.delay_ready)
     else:
         home.wake = NEVER
-
-
-__all__ = ["DEMANDED", "HIT_RESERVED", "arrive", "come_back", "step_cache"]

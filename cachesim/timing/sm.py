@@ -444,6 +444,3 @@ def place_ctas(state):  # type: ignore[no-untyped-def]
                 start_warp(state, index, slot, place, work.warp_first[at], rows, machine.age)
         sm.wake = min(sm.wake, machine.now + 1)
         machine.last_sm = index
-
-
-__all__ = ["place_ctas", "schedule", "step_sm"]
