@@ -20,15 +20,11 @@ from cachesim.counts import (
     BYPASSES,
     DIRTY,
     HIT_BACK,
-    HIT_EVICT,
-    HIT_THROUGH,
     HITS,
     LINE_MISSES,
-    MISS_ALLOCATE,
-    MISS_FETCH,
-    MISS_LAZY,
-    MISS_NONE,
     NUM_COUNTERS,
+    ON_HIT,
+    ON_MISS,
     PARTIAL,
     REQUESTS,
     SECTOR_MISSES,
@@ -42,21 +38,6 @@ from cachesim.counts import (
 )
 from cachesim.lookup import FIRST_RECENCY, NO_LINE, NO_TAG, SMALL_WAYS
 from cachesim.stream import Outcome, Requests
-
-_ON_HIT = {
-    "read-only": HIT_THROUGH,
-    "write-through": HIT_THROUGH,
-    "write-back": HIT_BACK,
-    "write-evict": HIT_EVICT,
-    # Local write-back, global write-evict: a texel store is global.
-    "local-write-back": HIT_EVICT,
-}
-_ON_MISS = {
-    "none": MISS_NONE,
-    "write-allocate": MISS_ALLOCATE,
-    "fetch-on-write": MISS_FETCH,
-    "lazy-fetch-on-read": MISS_LAZY,
-}
 
 
 class CacheState(NamedTuple):
@@ -125,7 +106,7 @@ def cache_rules(
     first_line: given where all line numbers are known to lie in [first_line, first_line + 2^32 -
         2]; lets sets be small.
     """
-    on_hit = _ON_HIT[level.write_policy]
+    on_hit = ON_HIT[level.write_policy]
     small = (
         first_line is not None and level.ways <= SMALL_WAYS and level.replacement in ("lru", "fifo")
     )
@@ -137,7 +118,7 @@ def cache_rules(
         sectors_per_line=level.sectors_per_line,
         all_bytes=(1 << min(32, level.sector_bytes)) - 1,
         on_hit=on_hit,
-        on_miss=_ON_MISS[level.write_allocate],
+        on_miss=ON_MISS[level.write_allocate],
         can_be_dirty=int(on_hit == HIT_BACK and not bypass_stores),
         bypass_loads=int(bypass_loads),
         bypass_stores=int(bypass_stores),

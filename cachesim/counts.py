@@ -28,6 +28,21 @@ NUM_COUNTERS = 13
 # What a store does on a present sector, and on an absent one (facts sheet 3.2, `wr` and `wralloc`).
 HIT_THROUGH, HIT_BACK, HIT_EVICT = range(3)
 MISS_NONE, MISS_ALLOCATE, MISS_FETCH, MISS_LAZY = range(4)
+#: By the names in `cachesim.config`.
+ON_HIT = {
+    "read-only": HIT_THROUGH,
+    "write-through": HIT_THROUGH,
+    "write-back": HIT_BACK,
+    "write-evict": HIT_EVICT,
+    # Local write-back, global write-evict: a texel store is global.
+    "local-write-back": HIT_EVICT,
+}
+ON_MISS = {
+    "none": MISS_NONE,
+    "write-allocate": MISS_ALLOCATE,
+    "fetch-on-write": MISS_FETCH,
+    "lazy-fetch-on-read": MISS_LAZY,
+}
 
 # Places in a line's four flag bytes: whether it holds a tag, its readable sectors, those written in
 # part and not readable, those to write back.

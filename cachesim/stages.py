@@ -10,18 +10,15 @@ from collections.abc import Callable, Mapping
 import numpy as np
 import numpy.typing as npt
 
+from cachesim.addressing import addressing
 from cachesim.coalesce import groups_of, placement_of, program_of
-from cachesim.config import L1, FetchPath, Gpu
+from cachesim.config import L1, Gpu
 from cachesim.counts import CountedLevel
 from cachesim.dispatch import Dispatcher
 from cachesim.hierarchy import BATCH_ROWS, Hierarchy
 from cachesim.level import Level
-from traces.errors import unknown
-from traces.placement import place
 from traces.texture import MAX_MIPS
 from traces.trace import Chunk, Trace
-
-FETCH_PATHS: tuple[FetchPath, ...] = ("texture", "readonly", "global")
 
 
 class Stages:
@@ -49,12 +46,9 @@ class Stages:
             InputError: unknown fetch path or layout, or a trace that does not fit.
         """
         self._trace = trace
-        default = gpu.lane_address_path if trace.is_lane_address else "texture"
-        self.fetch_path = fetch_path or default
-        if self.fetch_path not in FETCH_PATHS:
-            raise unknown("fetch path", self.fetch_path, FETCH_PATHS)
-        self.layout = None if trace.is_lane_address else layout or gpu.texture_layout
-        address_map = place(trace.textures, self.layout, overrides=layouts) if self.layout else None
+        self.fetch_path, self.layout, address_map = addressing(
+            trace, gpu, fetch_path, layout, layouts
+        )
         byte_range = (
             (address_map.base_address, address_map.footprint_bytes) if address_map else None
         )

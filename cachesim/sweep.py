@@ -23,11 +23,11 @@ from typing import Any
 import pandas as pd
 
 from cachesim import presets
+from cachesim.addressing import FETCH_PATHS
 from cachesim.config import Gpu
 from cachesim.dispatch import resident_ctas
 from cachesim.report import Report
 from cachesim.simulate import simulate_all
-from cachesim.stages import FETCH_PATHS
 from traces.errors import InputError, WorkError, unknown
 from traces.layout import layout_function
 from traces.open import open_trace

@@ -14,9 +14,9 @@ from reference_simulator import slow_simulate
 from strategies import lane_address_traces, texel_traces, traces
 
 from cachesim import Gpu, presets, simulate, simulate_all
+from cachesim.addressing import FETCH_PATHS
 from cachesim.coalesce import groups_of
 from cachesim.level import Level
-from cachesim.stages import FETCH_PATHS
 from cachesim.stream import GROUP_BITS, LOAD
 from traces.synthetic import gather, pixel_pass, scatter, stream
 from traces.texture import MAX_MIPS, Texture, pack_texel

@@ -12,20 +12,19 @@ from typing import Protocol
 import numpy as np
 import numpy.typing as npt
 
+from cachesim.addressing import addressing
 from cachesim.coalesce import groups_of, placement_of, program_of
-from cachesim.config import L1, FetchPath, Gpu
+from cachesim.config import L1, Gpu
 from cachesim.counts import ACCESSES, CountedLevel
 from cachesim.report import ConservationError, DramCounters
 from cachesim.timing import engine, machine, records
 from cachesim.timing.feed import Feed
 from cachesim.timing.outcome import Snapshot, dirty_sectors, passes_of, raw_counters
 from cachesim.timing.results import PassTiming, TimingResult
-from traces.errors import WorkError, unknown
-from traces.placement import place
+from traces.errors import WorkError
 from traces.texture import MAX_MIPS
 from traces.trace import Chunk, Launch, Trace
 
-FETCH_PATHS: tuple[FetchPath, ...] = ("texture", "readonly", "global")
 #: Cycles between two calls of a progress function.
 _PAUSE = 1 << 18
 #: Cycles between two samples of a timeline's counters.
@@ -67,12 +66,9 @@ class Clock:
             InputError: unknown fetch path or layout, a trace or a GPU that timing cannot run.
         """
         self._trace, self._gpu = trace, gpu
-        default = gpu.lane_address_path if trace.is_lane_address else "texture"
-        self.fetch_path = fetch_path or default
-        if self.fetch_path not in FETCH_PATHS:
-            raise unknown("fetch path", self.fetch_path, FETCH_PATHS)
-        self.layout = None if trace.is_lane_address else layout or gpu.texture_layout
-        address_map = place(trace.textures, self.layout, overrides=layouts) if self.layout else None
+        self.fetch_path, self.layout, address_map = addressing(
+            trace, gpu, fetch_path, layout, layouts
+        )
         self.pairs = groups_of(trace)
         self.num_groups = max(1, len(self.pairs)) * MAX_MIPS
         self.state = machine.build(gpu, self.fetch_path, self.num_groups)

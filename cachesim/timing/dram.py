@@ -10,6 +10,7 @@ import numpy as np
 
 from cachesim.compiled import compiled
 from cachesim.timing.access import DOWN, drop_request
+from cachesim.timing.bits import bit_at
 from cachesim.timing.records import MAX_DRAM_BANKS, NEVER, WRITEBACK
 from cachesim.timing.slice import come_back
 
@@ -148,8 +149,8 @@ def _serve_bank(state, index):  # type: ignore[no-untyped-def]
         if bank.last == chosen:
             bank.last = before
         if bank.first < 0:
-            channel.waiting &= ~(U64(1) << U64(b))
-        channel.serving |= U64(1) << U64(b)
+            channel.waiting &= ~bit_at(b)
+        channel.serving |= bit_at(b)
         bank.serving = chosen
         bank.row = requests[chosen].row
         bank.write = requests[chosen].write
@@ -210,7 +211,7 @@ def _column_command(state, index):  # type: ignore[no-untyped-def]
         bank.left -= 1
         if bank.left == 0:
             bank.serving = -1
-            channel.serving &= ~(U64(1) << U64(b))
+            channel.serving &= ~bit_at(b)
             channel.num_serving -= 1
         return True
     return False
@@ -273,7 +274,7 @@ def _enter(state, index):  # type: ignore[no-untyped-def]
         else:
             requests[bank.last].next[_LINK] = request
         bank.last = request
-        channel.waiting |= U64(1) << U64(one.bank)
+        channel.waiting |= bit_at(one.bank)
         channel.pending += 1
 
 

@@ -13,14 +13,9 @@ import numpy.typing as npt
 from cachesim.address import RANDOM, partition_of, set_hash
 from cachesim.config import L2, CacheLevel, Gpu
 from cachesim.counts import (
-    HIT_BACK,
-    HIT_EVICT,
-    HIT_THROUGH,
-    MISS_ALLOCATE,
-    MISS_FETCH,
-    MISS_LAZY,
-    MISS_NONE,
     NUM_COUNTERS,
+    ON_HIT,
+    ON_MISS,
 )
 from cachesim.timing import records
 from cachesim.timing.network import Network
@@ -40,20 +35,6 @@ from cachesim.timing.tags import Tags
 from cachesim.timing_config import CacheTiming, L1Timing
 from traces.errors import InputError
 
-_ON_HIT = {
-    "read-only": HIT_THROUGH,
-    "write-through": HIT_THROUGH,
-    "write-back": HIT_BACK,
-    "write-evict": HIT_EVICT,
-    # Local write-back, global write-evict: a texel store is global.
-    "local-write-back": HIT_EVICT,
-}
-_ON_MISS = {
-    "none": MISS_NONE,
-    "write-allocate": MISS_ALLOCATE,
-    "fetch-on-write": MISS_FETCH,
-    "lazy-fetch-on-read": MISS_LAZY,
-}
 _FIRST_POOL = 1 << 14
 _FIRST_DRAWS = 1 << 15
 
@@ -151,7 +132,6 @@ def _level_rules(
     instances: int,
     timing: L1Timing | CacheTiming,
     core_hz: int,
-    room: int,
 ) -> npt.NDArray[np.void]:
     """The `records.LEVEL` of one level."""
     rules = np.zeros(1, records.LEVEL)
@@ -166,8 +146,8 @@ def _level_rules(
     one["touch_on_hit"] = level.replacement == "lru"
     one["on_miss_allocation"] = timing.allocation == "on-miss"
     one["on_hit"], one["on_store_miss"] = (
-        _ON_HIT[level.write_policy],
-        _ON_MISS[level.write_allocate],
+        ON_HIT[level.write_policy],
+        ON_MISS[level.write_allocate],
     )
     one["is_read_only"] = level.write_policy == "read-only"
     one["all_bytes"] = (1 << min(32, level.sector_bytes)) - 1
@@ -218,7 +198,7 @@ def _tags(
         room = power_of_two(8 * (widest + latency) + timing.miss_queue + 64)
     else:
         room = power_of_two(timing.miss_queue + 32)
-    rules = _level_rules(index, level, instances, timing, core_hz, room)
+    rules = _level_rules(index, level, instances, timing, core_hz)
     lines = instances * level.num_sets * level.ways
     mshrs = instances * timing.num_mshrs
     tags = Tags(
@@ -291,7 +271,7 @@ def _network(
         np.zeros(outputs, records.OUTLET),
         np.zeros((outputs, out_room), np.int32),
         np.zeros((outputs, out_room), np.int64),
-        np.array([0, latency, 0, 0], np.int64),
+        np.array([0, latency], np.int64),
     )
     network.outputs["stamp"] = -1
     return network
@@ -482,7 +462,6 @@ def build(gpu: Gpu, fetch_path: str, num_groups: int) -> State:
         np.zeros((5, 2), np.int64),
         np.zeros(5, np.int64),
         np.zeros(1, np.int64),
-        np.zeros(5, np.int64),
     )  # fmt: skip
 
 

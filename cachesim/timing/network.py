@@ -22,9 +22,7 @@ class Network(NamedTuple):
     inputs: (I,) `records.PORT`, in_ring: (I, room) int32, in_time: (I, room) int64 cycle from which
     a packet may move; in_out: (I, room) int32 its output, in_flits: (I, room) int32.
     outputs: (O,) `records.OUTLET`, out_ring, out_time: (O, room); an output-queued one's `busy` is
-    in 1/256 cycles. wake: (O,) int64, when the
-    receiver has something to take. scalars: (4,) int64, packets held at inputs, the latency,
-    packets in all, cycles with a blocked head.
+    in 1/256 cycles. scalars: (2,) int64, packets held at inputs, the latency.
     """
 
     inputs: npt.NDArray[np.void]
@@ -38,7 +36,7 @@ class Network(NamedTuple):
     scalars: npt.NDArray[np.int64]
 
 
-AT_INPUTS, LATENCY, PACKETS, BLOCKED = range(4)
+AT_INPUTS, LATENCY = range(2)
 
 
 @compiled
@@ -53,7 +51,6 @@ def has_room(machine, net, source, output):  # type: ignore[no-untyped-def]
 def push(machine, net, source, output, request, payload_bytes, time):  # type: ignore[no-untyped-def]
     """Enter a packet that may move from cycle `time` on."""
     size = payload_bytes + machine.header_bytes
-    net.scalars[PACKETS] += 1
     if machine.output_queued:
         outlet = net.outputs[output]
         room = net.out_ring.shape[1] - 1
@@ -105,7 +102,6 @@ def transfer(machine, net, now):  # type: ignore[no-untyped-def]
     if offered == 0:
         return
     in_room, out_room = net.in_ring.shape[1] - 1, net.out_ring.shape[1] - 1
-    moved = 0
     for output in range(num_outputs):
         outlet = net.outputs[output]
         if outlet.stamp != now or outlet.first < 0:
@@ -133,12 +129,10 @@ def transfer(machine, net, now):  # type: ignore[no-untyped-def]
         port.in_head = (port.in_head + 1) & in_room
         port.in_count -= 1
         net.scalars[AT_INPUTS] -= 1
-        moved += 1
         if flits > 1:
             port.in_busy = now + flits
         elif machine.match_again:
             _offer(net, best, now)
-    net.scalars[BLOCKED] += offered - moved
 
 
 @compiled

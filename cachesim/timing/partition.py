@@ -81,15 +81,22 @@ def _draw(draws, slices):  # type: ignore[no-untyped-def]
 
 
 @compiled
+def _drawn(route, address):  # type: ignore[no-untyped-def]
+    """The slice of an address under a random partition, drawn if nobody asked for it before."""
+    run = address >> route.numbers[2]
+    at = _slot(route.draws, run)
+    if route.draws[at] < 0:
+        route.draws[at] = run
+        route.draws[at + 1] = _draw(route.draws, route.numbers[4])
+        route.draws[DRAWN] += 1
+    return route.draws[at + 1]
+
+
+@compiled
 def touch_address(route, address):  # type: ignore[no-untyped-def]
     """Draw an address's slice if nobody asked for it before."""
     if route.numbers[3] == RANDOM:
-        run = address >> route.numbers[2]
-        at = _slot(route.draws, run)
-        if route.draws[at] < 0:
-            route.draws[at] = run
-            route.draws[at + 1] = _draw(route.draws, route.numbers[4])
-            route.draws[DRAWN] += 1
+        _drawn(route, address)
 
 
 @compiled
@@ -108,8 +115,7 @@ def locate(route, address):  # type: ignore[no-untyped-def]
         U64(numbers[6]),
     )
     if numbers[3] == RANDOM:
-        touch_address(route, address)
-        return route.draws[_slot(route.draws, address >> numbers[2]) + 1], np.int64(number)
+        return _drawn(route, address), np.int64(number)
     return np.int64(where), np.int64(number)
 
 

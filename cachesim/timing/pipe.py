@@ -31,6 +31,7 @@ from cachesim.timing.records import (
     R_L1_BANDWIDTH,
     R_L1_RESERVATION,
 )
+from cachesim.timing.slice import arrive
 from cachesim.timing.tags import next_ready
 from cachesim.timing.warp import sector_back, store_done
 
@@ -48,12 +49,7 @@ def send_up(state, request):  # type: ignore[no-untyped-def]
         level = state.gl1.level[0]
         if node.delay_count + node.in_count >= level.queue_in:
             return False
-        room = state.gl1.queues.shape[2] - 1
-        state.gl1.queues[one.port, 1, (node.delay_head + node.delay_count) & room] = request
-        one.ready = machine.now + 1 + level.latency
-        if node.delay_count == 0:
-            node.delay_ready = one.ready
-        node.delay_count += 1
+        arrive(state.gl1, state.pool, one.port, request, machine.now + 1 + level.latency)
         one.mark = machine.now
         node.wake = min(node.wake, one.ready)
         return True
@@ -393,7 +389,6 @@ def _take_instruction(state, index, unit):  # type: ignore[no-untyped-def]
     if instruction.operation == ATOMIC:
         pipe.path = PATH_BYPASS
     pipe.free_at = now + _law_cycles(state, row, instruction)
-    state.moved[0] += row.sectors << state.l1.level[0].sector_shift
     if row.sectors == 0 and instruction.operation == STORE:
         store_done(state, pipe.warp)
         pipe.warp = -1

@@ -268,7 +268,7 @@ def _issue(state, index, scheduler):  # type: ignore[no-untyped-def]
     if candidates == 0:
         return 0
     slot = _pick(state, index, scheduler, candidates)
-    bit = U64(1) << U64(slot)
+    bit = bit_at(slot)
     warp = state.warps[index * MAX_WARPS + slot]
     issued = 0
     previous = -1

@@ -88,7 +88,7 @@ class State(NamedTuple):
     fifo: (units, 3, room) int32, the texture L1's reorder buffer, requests and results.
     scheduler_masks: (schedulers,) uint64. reasons: (reasons,) int64 SM-cycles.
     latency: (5, 2) int64, by level that gave the data: sum, number. issued: (5,) int64 by
-    kind. resident: (1,) int64 warp-cycles. moved: (5,) int64 bytes at each level's port.
+    kind. resident: (1,) int64 warp-cycles.
     """
 
     pool: Pool
@@ -117,7 +117,6 @@ class State(NamedTuple):
     latency: npt.NDArray[np.int64]
     issued: npt.NDArray[np.int64]
     resident: npt.NDArray[np.int64]
-    moved: npt.NDArray[np.int64]
 
 
 _I64, _I32, _U32, _U8 = np.int64, np.int32, np.uint32, np.uint8
@@ -224,6 +223,5 @@ define(
         "latency": (_I64, 2),
         "issued": (_I64, 1),
         "resident": (_I64, 1),
-        "moved": (_I64, 1),
     },
 )

@@ -114,7 +114,7 @@ def schedule(state, index, slot, earliest):  # type: ignore[no-untyped-def]
         # Its last result is still being collected; `collect` will say when it is there.
         warp.waits_chain = 0
         return
-    bit = np.uint64(1) << np.uint64(slot)
+    bit = bit_at(slot)
     if ready <= machine.now:
         sm.ready[kind] |= bit
     else:
