@@ -11,9 +11,11 @@ from typing import Any
 
 from numba import njit
 
-_options: dict[str, Any] = {"cache": True, "nogil": True, "_nrt": False}
+_options: dict[str, Any] = {"cache": True, "nogil": True, "_nrt": False, "error_model": "numpy"}
 
 #: A compiled function.
 compiled: Any = njit(**_options)
+#: A small one that the machine code of its callers includes.
+small: Any = njit(**_options, forceinline=True)
 #: A small one that becomes part of the loop that calls it.
 inlined: Any = njit(**_options, inline="always")

@@ -23,8 +23,8 @@ from timing_machines import (
 from cachesim import presets, simulate
 from cachesim.config import Gpu
 from cachesim.timing.clock import Clock
-from cachesim.timing.machine import _network, build
-from cachesim.timing.network import arrival, has_room, pop, push, transfer
+from cachesim.timing.machine import build
+from cachesim.timing.network import arrival, has_room, new_network, pop, push, transfer
 from traces.errors import InputError, WorkError
 from traces.texture import Texture, pack_texel
 from traces.trace import Chunk, Instruction, Launch, Trace, from_chunks
@@ -218,7 +218,7 @@ def test_the_filters_take_so_many_quads_a_cycle(format: str, quads: int, expecte
 def crossbar(queueing: str, inputs: int, outputs: int) -> tuple[Any, Any]:
     gpu = one_sm(f"icnt.queueing={queueing}")
     machine = build(gpu, "readonly", 1).pool.machine
-    return machine[0], _network(inputs, outputs, 64, 64, 0, 64)
+    return machine[0], new_network(inputs, outputs, 128, 128, 0)
 
 
 def taken(machine: Any, net: Any, cycles: int) -> list[list[tuple[int, int]]]:
@@ -228,7 +228,7 @@ def taken(machine: Any, net: Any, cycles: int) -> list[list[tuple[int, int]]]:
     for now in range(cycles):
         for output in range(outputs):
             while arrival(net, output) <= now:
-                found[output].append((now, int(pop(net, output))))
+                found[output].append((now, int(pop(net, output)[0])))
         transfer(machine, net, now)
     return found
 

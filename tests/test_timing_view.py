@@ -43,7 +43,7 @@ def _look(address, a, b, c):  # type: ignore[no-untyped-def]
         view.grid[a, b, c],
         leaf.bytes[b, a],
         leaf.records[a].count,
-        view.last[-1],
+        view.last[len(view.last) - 1],
         view.grid.shape[0] * 100 + view.grid.shape[1] * 10 + view.grid.shape[2],
         len(leaf.records) * 100 + leaf.bytes.shape[0] * 10 + leaf.bytes.shape[1],
     )

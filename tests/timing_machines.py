@@ -202,7 +202,7 @@ def held_in(clock: Clock) -> dict[str, int]:
         held[f"{name}.reserved lines"] = int(tags.sets["reserved_lines"].sum())
     for name in ("up", "down"):
         net = getattr(state, name)
-        held[f"{name}.inputs"] = int(net.inputs["in_count"].sum()) + int(net.scalars[0])
+        held[f"{name}.inputs"] = int(net.inputs["count"].sum()) + int(net.scalars[0])
         held[f"{name}.outputs"] = int(net.outputs["count"].sum())
     for field in ("response_count", "in_banks", "fragment_count", "request_count", "result_count"):
         held[f"pipe.{field}"] = int(state.pipes[field].sum())

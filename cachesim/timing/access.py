@@ -7,7 +7,9 @@ taken at the miss (on-miss) or when the data arrives (on-fill, streaming).
 
 from __future__ import annotations
 
-from cachesim.compiled import compiled
+import numpy as np
+
+from cachesim.compiled import compiled, small
 from cachesim.counts import (
     ACCESSES,
     BYPASSED_WRITES,
@@ -36,6 +38,9 @@ from cachesim.timing.records import (
     HIT_RESERVED,
     MISS,
     MSHR_HIT,
+    NO_MSHR,
+    NO_OTHER,
+    NO_QUEUE,
     SECTOR_MISS,
     WRITE_FILL,
     WRITEBACK,
@@ -54,10 +59,10 @@ from cachesim.timing.tags import (
 )
 
 #: Rings of a node's `Tags.queues`.
-IN, DELAY, MISSES, DOWN, FILLS, OUT = range(6)
+IN, MISSES, DOWN, FILLS, OUT = range(5)
 
 
-@compiled
+@small
 def take_request(pool):  # type: ignore[no-untyped-def]
     """A free request of the pool, its links and parts empty."""
     machine = pool.machine[0]
@@ -65,14 +70,12 @@ def take_request(pool):  # type: ignore[no-untyped-def]
     machine.in_flight += 1
     at = pool.free[machine.free_top]
     one = pool.requests[at]
-    one.parent = -1
-    one.pending = 0
-    one.sectors = 1
+    one.is_part = 0
     one.source = 0
     return at
 
 
-@compiled
+@small
 def drop_request(pool, request):  # type: ignore[no-untyped-def]
     """Give a request back to the pool."""
     machine = pool.machine[0]
@@ -81,18 +84,30 @@ def drop_request(pool, request):  # type: ignore[no-untyped-def]
     machine.in_flight -= 1
 
 
-@compiled
+@small
+def since(then, now):  # type: ignore[no-untyped-def]
+    """Cycles from `then`, kept modulo 2^32, to `now`."""
+    return (now - np.int64(then)) & 0xFFFFFFFF
+
+
+@small
+def book(pool, stage, entered, now):  # type: ignore[no-untyped-def]
+    """Book the time from `entered`, modulo 2^32, to `now` for a stage."""
+    took = since(entered, now)
+    waits = pool.waits
+    waits[stage, 0] += took
+    waits[stage, 1] += 1
+    waits[stage, 2] = min(waits[stage, 2], took)
+
+
+@small
 def note(pool, stage, request, now):  # type: ignore[no-untyped-def]
     """Book the time a request spent in a stage, and start the next."""
-    took = now - pool.requests[request].mark
+    book(pool, stage, pool.requests[request].mark, now)
     pool.requests[request].mark = now
-    row = pool.waits[stage]
-    row[0] += took
-    row[1] += 1
-    row[2] = min(row[2], took)
 
 
-@compiled
+@small
 def push_miss(tags, node, request):  # type: ignore[no-untyped-def]
     """Append to the miss queue of an instance."""
     home = tags.nodes[node]
@@ -118,11 +133,9 @@ def _write_back(tags, pool, node, line, now):  # type: ignore[no-untyped-def]
             request.kind = WRITEBACK
             request.path = 0
             request.unit = 0
-            request.port = 0
             request.slice = node
             request.born = now
             request.mark = now
-            request.ready = now
             owner = tags.owner[line * level.sectors_per_line + s]
             request.group = owner
             full = (one.valid >> s) & 1
@@ -171,13 +184,16 @@ def _read(tags, pool, node, request, now):  # type: ignore[no-untyped-def]
         outcome = HIT_RESERVED if one.reserved & bit else SECTOR_MISS
     home = tags.nodes[node]
     if home.miss_count + 1 >= level.miss_queue:
+        home.fail_reason = NO_QUEUE
         return FAIL
+    home.fail_reason = NO_OTHER
     sector = address >> level.sector_shift
     entry = find_mshr(tags, node, sector)
     if entry >= 0:
         if tags.mshrs[entry].count >= level.merge:
             return FAIL
     elif home.mshr_used >= level.num_mshrs:
+        home.fail_reason = NO_MSHR
         return FAIL
     if level.on_miss_allocation:
         if outcome == MISS:
@@ -231,7 +247,6 @@ def _fetch_for_store(tags, pool, node, request, line, bit, now):  # type: ignore
     fetch.slice = source.slice
     fetch.lower = source.lower
     fetch.unit = source.unit
-    fetch.port = source.port
     fetch.group = source.group
     fetch.warp = -1
     # Whose fetch it is: the levels below answer it like any other.
@@ -242,8 +257,6 @@ def _fetch_for_store(tags, pool, node, request, line, bit, now):  # type: ignore
     fetch.path = source.path
     fetch.born = now
     fetch.mark = now
-    fetch.ready = now
-    fetch.bytes = 0
     reserve(tags, line, bit)
     tags.counters[source.group, WRITE_FILLS] += 1
     take_mshr(tags, pool.requests, node, source.address >> level.sector_shift, at)
@@ -331,6 +344,7 @@ def access(tags, pool, node, request, now):  # type: ignore[no-untyped-def]
     is_write = operation != LOAD
     sent = 0
     if operation == STORE:
+        tags.nodes[node].fail_reason = NO_OTHER
         outcome, sent = _write(tags, pool, node, request, now)
     else:
         outcome = _read(tags, pool, node, request, now)
@@ -348,22 +362,22 @@ def access(tags, pool, node, request, now):  # type: ignore[no-untyped-def]
     tags.outcomes[1 if is_write else 0, outcome] += 1
     if outcome == FAIL:
         return outcome, sent
-    row = tags.counters[group]
+    counters = tags.counters
     if tags.level[0].index > 0:
-        row[REQUESTS] += 1
-    row[ACCESSES] += 1
+        counters[group, REQUESTS] += 1
+    counters[group, ACCESSES] += 1
     if is_write:
-        row[WRITES] += 1
+        counters[group, WRITES] += 1
     if outcome == HIT or outcome == HIT_RESERVED:
-        row[HITS] += 1
+        counters[group, HITS] += 1
     else:
-        row[LINE_MISSES if outcome == MISS else SECTOR_MISSES] += 1
+        counters[group, LINE_MISSES if outcome == MISS else SECTOR_MISSES] += 1
         if operation == STORE:
-            row[WRITE_MISSES] += 1
+            counters[group, WRITE_MISSES] += 1
     return outcome, sent
 
 
-@compiled
+@small
 def count_bypass(tags, group, is_write):  # type: ignore[no-untyped-def]
     """A sector that goes around this level."""
     tags.counters[group, BYPASSES] += 1
@@ -396,3 +410,4 @@ def fill(tags, pool, node, request, now):  # type: ignore[no-untyped-def]
         one.partial &= ~bit
     mark_ready(tags, node, address >> level.sector_shift)
     tags.nodes[node].version += 1
+    tags.nodes[node].num_filled += 1

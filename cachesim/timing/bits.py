@@ -1,4 +1,4 @@
-"""Bit masks of warps."""
+"""Bit masks, and powers of two."""
 
 from __future__ import annotations
 
@@ -9,9 +9,14 @@ from llvmlite import ir  # type: ignore[import-untyped]
 from numba import types
 from numba.extending import intrinsic
 
-from cachesim.compiled import compiled
+from cachesim.compiled import small
 
 U64 = np.uint64
+
+
+def power_of_two(number: int) -> int:
+    """The least power of two that is not below `number`."""
+    return 1 << max(0, number - 1).bit_length()
 
 
 @intrinsic
@@ -22,19 +27,19 @@ def _trailing_zeros(typingctx: Any, mask: Any) -> Any:
     return types.int64(types.uint64), codegen
 
 
-@compiled
+@small
 def lowest(mask):  # type: ignore[no-untyped-def]
     """Place of the lowest bit that is set; `mask` is not 0."""
     return _trailing_zeros(mask)  # type: ignore[call-arg]
 
 
-@compiled
+@small
 def bit_at(place):  # type: ignore[no-untyped-def]
     """The mask with one bit."""
     return U64(1) << U64(place)
 
 
-@compiled
+@small
 def without_lowest(mask):  # type: ignore[no-untyped-def]
     """`mask` without its lowest bit."""
     return mask & (mask - U64(1))

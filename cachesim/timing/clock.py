@@ -221,12 +221,12 @@ class Clock:
                         f"{name}.{queue} {int(held.sum())} (instance {int(held.argmax())})"
                     )
         for name, net in (("request network", state.up), ("reply network", state.down)):
-            for side, ports, count in (
-                ("in", net.inputs, "in_count"),
-                ("out", net.outputs, "count"),
+            for side, ports in (
+                ("in", net.inputs),
+                ("out", net.outputs),
             ):
-                if ports[count].sum():
-                    found.append(f"{name} {side} {int(ports[count].sum())}")
+                if ports["count"].sum():
+                    found.append(f"{name} {side} {int(ports['count'].sum())}")
         pipes = state.pipes
         for name, counts in (
             ("l1 banks", pipes["in_banks"]),

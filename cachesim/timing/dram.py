@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from cachesim.compiled import compiled
+from cachesim.compiled import compiled, small
 from cachesim.timing.access import DOWN, drop_request
-from cachesim.timing.bits import bit_at
+from cachesim.timing.bits import bit_at, lowest
 from cachesim.timing.records import MAX_DRAM_BANKS, NEVER, WRITEBACK
 from cachesim.timing.slice import come_back
 
@@ -19,11 +19,11 @@ U64 = np.uint64
 
 
 @compiled
-def _bits(address, positions):  # type: ignore[no-untyped-def]
-    """The number that an address's bits at `positions` make up, the lowest first."""
+def _bits(address, positions, which):  # type: ignore[no-untyped-def]
+    """The number that an address's bits at row `which` of `positions` make up, the lowest first."""
     value, k = 0, 0
-    while positions[k] >= 0:
-        value |= ((address >> positions[k]) & 1) << k
+    while positions[which, k] >= 0:
+        value |= ((address >> positions[which, k]) & 1) << k
         k += 1
     return value
 
@@ -36,17 +36,17 @@ def place(state, request):  # type: ignore[no-untyped-def]
     address = one.address
     shift = machine.channel_shift
     rest = ((address >> shift) // machine.num_channels) << shift | (address & ((1 << shift) - 1))
-    bank = _bits(rest, state.memory.bits[0])
+    bank = _bits(rest, state.memory.bits, 0)
     one.bank = bank
-    one.row = _bits(rest, state.memory.bits[1])
+    one.row = _bits(rest, state.memory.bits, 1)
 
 
-@compiled
+@small
 def _has_credit(machine, channel, sub):  # type: ignore[no-untyped-def]
     return channel.private_credit[sub] < 1 or channel.shared_credit < machine.shared_credits
 
 
-@compiled
+@small
 def _borrow(channel, sub):  # type: ignore[no-untyped-def]
     if channel.private_credit[sub] < 1:
         channel.private_credit[sub] += 1
@@ -54,7 +54,7 @@ def _borrow(channel, sub):  # type: ignore[no-untyped-def]
         channel.shared_credit += 1
 
 
-@compiled
+@small
 def _give_back(channel, sub):  # type: ignore[no-untyped-def]
     if channel.private_credit[sub] > 0:
         channel.private_credit[sub] -= 1
@@ -62,7 +62,7 @@ def _give_back(channel, sub):  # type: ignore[no-untyped-def]
         channel.shared_credit -= 1
 
 
-@compiled
+@small
 def _return_oldest(state, tags, index):  # type: ignore[no-untyped-def]
     """Pass one finished read to its slice."""
     machine = state.pool.machine[0]
@@ -82,7 +82,7 @@ def _return_oldest(state, tags, index):  # type: ignore[no-untyped-def]
     channel.return_count -= 1
 
 
-@compiled
+@small
 def _finish_data(state, index):  # type: ignore[no-untyped-def]
     """The oldest column command's data is there."""
     machine = state.pool.machine[0]
@@ -114,6 +114,13 @@ def _finish_data(state, index):  # type: ignore[no-untyped-def]
     channel.return_count += 1
 
 
+@small
+def _first_from(banks, priority):  # type: ignore[no-untyped-def]
+    """The first bank of a mask that is not empty, from `priority` on, around."""
+    after = banks & ~(bit_at(priority) - U64(1))
+    return lowest(after if after != 0 else banks)
+
+
 @compiled
 def _serve_bank(state, index):  # type: ignore[no-untyped-def]
     """Give one idle bank its next request: the oldest of its open row, or the oldest."""
@@ -123,14 +130,8 @@ def _serve_bank(state, index):  # type: ignore[no-untyped-def]
     requests = state.pool.requests
     num_banks = machine.num_dram_banks
     free = channel.waiting & ~channel.serving
-    if free == 0:
-        return False
-    for k in range(num_banks):
-        b = k + channel.priority
-        if b >= num_banks:
-            b -= num_banks
-        if (free >> U64(b)) & U64(1) == 0:
-            continue
+    if free != 0:
+        b = _first_from(free, channel.priority)
         bank = memory.banks[index * MAX_DRAM_BANKS + b]
         chosen, before = bank.first, -1
         if machine.fr_fcfs and bank.open_row >= 0:
@@ -157,6 +158,8 @@ def _serve_bank(state, index):  # type: ignore[no-untyped-def]
         bank.left = requests[chosen].pending
         channel.pending -= 1
         channel.num_serving += 1
+        channel.column_from = 0
+        channel.row_from = 0
         channel.priority = channel.priority + 1 if channel.priority + 1 < num_banks else 0
         return True
     return False
@@ -169,32 +172,31 @@ def _column_command(state, index):  # type: ignore[no-untyped-def]
     memory = state.memory
     channel = memory.channels[index]
     tick = machine.tick
-    if channel.ccd > tick:
+    if channel.ccd > tick or channel.column_from > tick:
         return False
-    num_banks = machine.num_dram_banks
-    for k in range(num_banks):
-        b = k + channel.priority
-        if b >= num_banks:
-            b -= num_banks
-        if (channel.serving >> U64(b)) & U64(1) == 0:
-            continue
+    left = channel.serving
+    soonest = NEVER
+    while left != 0:
+        b = _first_from(left, channel.priority)
+        left &= ~bit_at(b)
         bank = memory.banks[index * MAX_DRAM_BANKS + b]
         if bank.open_row != bank.row:
             continue
         group = memory.groups[index * MAX_DRAM_BANKS + (b & machine.group_mask)]
-        if group.ccdl > tick:
+        if bank.write:
+            may = max(group.ccdl, bank.rcdwr, channel.rtw)
+        else:
+            may = max(group.ccdl, bank.rcd, channel.wtr)
+        if may > tick:
+            soonest = min(soonest, may)
             continue
         if bank.write:
-            if bank.rcdwr > tick or channel.rtw > tick:
-                continue
             channel.is_writing = 1
             channel.wtr = tick + machine.wtr
             bank.wtp = tick + machine.wtp
             delay = machine.wl
             machine.dram_writes += 1
         else:
-            if bank.rcd > tick or channel.wtr > tick:
-                continue
             channel.is_writing = 0
             channel.rtw = tick + machine.rtw
             bank.rtp = tick + machine.rtpl
@@ -214,6 +216,7 @@ def _column_command(state, index):  # type: ignore[no-untyped-def]
             channel.serving &= ~bit_at(b)
             channel.num_serving -= 1
         return True
+    channel.column_from = soonest
     return False
 
 
@@ -224,17 +227,20 @@ def _row_command(state, index):  # type: ignore[no-untyped-def]
     memory = state.memory
     channel = memory.channels[index]
     tick = machine.tick
+    if channel.row_from > tick:
+        return False
     num_banks = machine.num_dram_banks
-    for k in range(num_banks):
-        b = k + channel.priority
-        if b >= num_banks:
-            b -= num_banks
-        if (channel.serving >> U64(b)) & U64(1) == 0:
-            continue
+    left = channel.serving
+    soonest = NEVER
+    while left != 0:
+        b = _first_from(left, channel.priority)
+        left &= ~bit_at(b)
         bank = memory.banks[index * MAX_DRAM_BANKS + b]
         row = bank.row
         if bank.open_row < 0:
-            if channel.rrd <= tick and bank.rp <= tick and bank.rc <= tick:
+            may = max(channel.rrd, bank.rp, bank.rc)
+            soonest = min(soonest, may)
+            if may <= tick:
                 bank.open_row = row
                 channel.rrd = tick + machine.rrd
                 bank.rcd = tick + machine.rcd
@@ -243,15 +249,19 @@ def _row_command(state, index):  # type: ignore[no-untyped-def]
                 bank.rc = tick + machine.rc
                 channel.priority = b + 1 if b + 1 < num_banks else 0
                 machine.activates += 1
+                channel.column_from = 0
                 return True
         elif bank.open_row != row:
             group = memory.groups[index * MAX_DRAM_BANKS + (b & machine.group_mask)]
-            if bank.ras <= tick and bank.wtp <= tick and bank.rtp <= tick and group.rtpl <= tick:
+            may = max(bank.ras, bank.wtp, bank.rtp, group.rtpl)
+            soonest = min(soonest, may)
+            if may <= tick:
                 bank.open_row = -1
                 bank.rp = tick + machine.rp
                 channel.priority = b + 1 if b + 1 < num_banks else 0
                 machine.precharges += 1
                 return True
+    channel.row_from = soonest
     return False
 
 
@@ -284,8 +294,9 @@ def _take_from_slices(state, tags, index):  # type: ignore[no-untyped-def]
     machine = state.pool.machine[0]
     memory = state.memory
     channel = memory.channels[index]
-    for k in range(machine.subslices):
-        sub = (k + channel.last_borrower + 1) % machine.subslices
+    sub = channel.last_borrower
+    for _ in range(machine.subslices):
+        sub = sub + 1 if sub + 1 < machine.subslices else 0
         node = index * machine.subslices + sub
         home = tags.nodes[node]
         if home.down_count == 0 or not _has_credit(machine, channel, sub):
@@ -311,7 +322,7 @@ def _take_from_slices(state, tags, index):  # type: ignore[no-untyped-def]
         return
 
 
-@compiled
+@small
 def _leave_delay(state, index):  # type: ignore[no-untyped-def]
     machine = state.pool.machine[0]
     memory = state.memory

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from cachesim.compiled import compiled
-from cachesim.timing.access import DOWN, OUT, drop_request, note, take_request
+from cachesim.compiled import compiled, small
+from cachesim.timing.access import DOWN, OUT, book, drop_request, take_request
 from cachesim.timing.dram import is_idle, next_delay, step_channel
 from cachesim.timing.network import AT_INPUTS, arrival, has_room, pop, push, transfer
 from cachesim.timing.partition import is_filling_table, locate
@@ -19,7 +19,7 @@ from cachesim.timing.records import NEVER, PATH_FIFO, S_REPLY, S_REQUEST, WRITEB
 from cachesim.timing.slice import arrive, come_back, step_cache
 from cachesim.timing.sm import place_ctas, step_sm
 from cachesim.timing.state import State
-from cachesim.timing.view import opener, table_of
+from cachesim.timing.view import opener, prefetch, table_of
 
 _open_state = opener("State")
 
@@ -29,7 +29,7 @@ DONE, NEEDS_CTAS, NEEDS_ROOM, STUCK, PAUSED = range(5)
 PATIENCE = 100_000
 
 
-@compiled
+@small
 def _give_to_sm(state, index, request):  # type: ignore[no-untyped-def]
     sm = state.sms[index]
     room = state.ejection.shape[1] - 1
@@ -55,8 +55,8 @@ def _receive_replies(state):  # type: ignore[no-untyped-def]
             pipe = state.pipes[unit]
             if pipe.response_count >= machine.response:
                 break
-            sm.eject_head = (sm.eject_head + 1) & room
             sm.eject_count -= 1
+            sm.eject_head = (sm.eject_head + 1) & room if sm.eject_count > 0 else 0
             to = state.responses.shape[1] - 1
             state.responses[unit, (pipe.response_head + pipe.response_count) & to] = request
             pipe.response_count += 1
@@ -64,8 +64,9 @@ def _receive_replies(state):  # type: ignore[no-untyped-def]
         for _ in range(0 if machine.has_gl1 else machine.replies_per_cycle):
             if sm.eject_count >= machine.ejection or arrival(state.down, index) > now:
                 break
-            request = pop(state.down, index)
-            note(state.pool, S_REPLY, request, now)
+            request, entered = pop(state.down, index)
+            book(state.pool, S_REPLY, entered, now)
+            prefetch(state.pool.requests, request)  # type: ignore[call-arg]
             _give_to_sm(state, index, request)
             machine.progress = now
 
@@ -76,7 +77,7 @@ def _join(state, tags, request):  # type: ignore[no-untyped-def]
     is not a part, and -1 otherwise.
     """
     one = state.pool.requests[request]
-    if one.parent < 0:
+    if not one.is_part:
         return request
     parent = one.parent
     state.pool.requests[parent].pending -= 1
@@ -97,8 +98,8 @@ def _step_gl1s(state):  # type: ignore[no-untyped-def]
         width = tags.level[0].width
         for _ in range(width):
             if home.fill_count < tags.level[0].queue_fill and arrival(state.down, node) <= now:
-                request = pop(state.down, node)
-                note(state.pool, S_REPLY, request, now)
+                request, entered = pop(state.down, node)
+                book(state.pool, S_REPLY, entered, now)
                 come_back(tags, state.pool, node, request)
                 home.wake = min(home.wake, now)
         if home.wake > now:
@@ -135,13 +136,13 @@ def _send_replies(state):  # type: ignore[no-untyped-def]
                 break
             request = tags.queues[node, OUT, home.out_head & room]
             one = state.pool.requests[request]
-            if not has_room(machine, state.down, node, one.port):
+            port = state.port_of[one.unit]
+            if not has_room(machine, state.down, node, port):
                 break
             home.out_head += 1
             home.out_count -= 1
-            one.mark = machine.now
             payload = 0 if one.write else 1 << machine.l2_sector_shift
-            push(machine, state.down, node, one.port, request, payload, machine.now)
+            push(machine, state.down, node, port, request, payload, machine.now)
 
 
 @compiled
@@ -154,7 +155,6 @@ def _split(state, request, parts, shift):  # type: ignore[no-untyped-def]
     one.warp = source.warp
     one.load = source.load
     one.unit = source.unit
-    one.port = source.port
     one.slice = source.slice
     one.lower = source.lower
     one.group = source.group
@@ -162,10 +162,12 @@ def _split(state, request, parts, shift):  # type: ignore[no-untyped-def]
     one.path = source.path
     one.kind = source.kind
     one.write = source.write
-    one.bytes = source.bytes
+    if source.write:
+        one.bytes = source.bytes
     one.born = source.born
     one.mark = source.mark
     one.parent = request
+    one.is_part = 1
     return index
 
 
@@ -196,24 +198,26 @@ def _receive_requests(state, node):  # type: ignore[no-untyped-def]
             return
         if machine.output_queued and home.delay_count >= level.delay_capacity:
             return
-        request = pop(state.up, node)
+        request, entered = pop(state.up, node)
         machine.progress = now
-        note(state.pool, S_REQUEST, request, now)
+        book(state.pool, S_REQUEST, entered, now)
         one = state.pool.requests[request]
-        delay = level.texture_latency if one.path == PATH_FIFO else level.latency
+        delay = level.latency
+        if machine.has_fifo_l1 and one.path == PATH_FIFO:
+            delay = level.texture_latency
         if machine.line_parts > 1:
             one.pending = machine.line_parts
             for part in range(machine.line_parts):
                 piece = _split(state, request, part, machine.l2_sector_shift)
                 if one.write:
                     # Each part of a store is acknowledged by itself.
-                    state.pool.requests[piece].parent = -1
+                    state.pool.requests[piece].is_part = 0
                     state.pool.requests[piece].bytes = _part_of_bytes(state, one.bytes, part)
-                arrive(tags, state.pool, node, piece, now + delay)
+                arrive(tags, node, piece, now + delay, now)
             if one.write:
                 drop_request(state.pool, request)
         else:
-            arrive(tags, state.pool, node, request, now + delay)
+            arrive(tags, node, request, now + delay, now)
         home.wake = min(home.wake, now)
 
 
@@ -254,10 +258,10 @@ def _step_llc(state):  # type: ignore[no-untyped-def]
             if parts > 1:
                 piece = _split(state, request, part, machine.llc_sector_shift)
                 if one.write and one.kind == WRITEBACK:
-                    state.pool.requests[piece].parent = -1
+                    state.pool.requests[piece].is_part = 0
             _, number = locate(state.llc_route, state.pool.requests[piece].address)
             state.pool.requests[piece].number = number
-            arrive(llc, state.pool, where, piece, now + llc.level[0].latency)
+            arrive(llc, where, piece, now + llc.level[0].latency, now)
         target.wake = min(target.wake, now + 1)
         if parts > 1 and one.write and one.kind == WRITEBACK:
             drop_request(state.pool, request)

@@ -168,7 +168,7 @@ class Feed:
         )
         state.pool.machine[0]["queued"] = len(work.cta_left)
         state.pool.machine[0]["row_mask"] = len(work.rows) - 1
-        state.pool.machine[0]["request_mask"] = len(work.line) - 1
+        state.pool.machine[0]["request_mask"] = len(work.asks) - 1
         return state._replace(work=work)
 
     def _coalesce(self, work: Work, lanes: Any, instruction: npt.NDArray[np.uint16]) -> Work:
@@ -184,10 +184,10 @@ class Feed:
         segments = requests.segments[: num + 1]
         total = int(segments[num])
         work = self._ask_room(work, total)
-        at = (self._ask_head + np.arange(total)) & (len(work.line) - 1)
-        work.line[at] = requests.line[:total].astype(I64)
-        work.mask[at] = requests.mask[:total]
-        work.group[at] = (requests.meta[:total] & 0xFFFFFF).astype(np.int32)
+        at = (self._ask_head + np.arange(total)) & (len(work.asks) - 1)
+        work.asks["line"][at] = requests.line[:total].astype(I64)
+        work.asks["mask"][at] = requests.mask[:total]
+        work.asks["group"][at] = (requests.meta[:total] & 0xFFFFFF).astype(np.int32)
         stores = np.flatnonzero(requests.meta[:total] >> 24 == STORE)
         if len(stores):
             work = self._granule_room(work, len(stores) * self._sectors)
@@ -243,7 +243,7 @@ class Feed:
     def _ask_room(self, work: Work, requests: int) -> Work:
         arrays = {
             name: _grown(getattr(work, name), self._ask_tail, self._ask_head, requests)
-            for name in ("line", "mask", "group", "written")
+            for name in ("asks", "written")
         }
         return work._replace(**arrays)
 

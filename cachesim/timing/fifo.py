@@ -38,13 +38,13 @@ def access(state, unit, request):  # type: ignore[no-untyped-def]
     tags = state.l1
     key = one.address >> tags.level[0].line_shift
     line = find_line(tags, unit, key)
-    row = tags.counters[one.group]
-    row[ACCESSES] += 1
+    counters = tags.counters
+    counters[one.group, ACCESSES] += 1
     room = state.fifo.shape[2] - 1
     if line >= 0:
         touch(tags, line)
         tags.outcomes[0, HIT_RESERVED] += 1
-        row[HITS] += 1
+        counters[one.group, HITS] += 1
         one.pending = 0
         one.sectors = 0
     else:
@@ -52,7 +52,7 @@ def access(state, unit, request):  # type: ignore[no-untyped-def]
         install(tags, unit, line, key)
         tags.lines[line].valid = 1
         tags.outcomes[0, MISS] += 1
-        row[LINE_MISSES] += 1
+        counters[one.group, LINE_MISSES] += 1
         # Until its sectors are back; they count it down.
         one.pending = machine.line_parts
         one.sectors = machine.line_parts
@@ -69,10 +69,10 @@ def access(state, unit, request):  # type: ignore[no-untyped-def]
 def arrived(state, unit, request):  # type: ignore[no-untyped-def]
     """One part of a line has come back."""
     one = state.pool.requests[request]
-    parent = one.parent
-    if parent < 0:
+    if not one.is_part:
         one.pending = 0
         return
+    parent = one.parent
     state.pool.requests[parent].pending -= 1
     state.pool.requests[parent].source = one.source
     drop_request(state.pool, request)

@@ -18,15 +18,18 @@ from cachesim.counts import (
     ON_MISS,
 )
 from cachesim.timing import records
-from cachesim.timing.network import Network
+from cachesim.timing.bits import power_of_two
+from cachesim.timing.network import new_network
 from cachesim.timing.partition import is_filling_table, larger_draws, new_draws
 from cachesim.timing.records import (
     MAX_BANKS,
     MAX_DRAM_BANKS,
     MAX_MEMORY_QUEUE,
     MAX_SCHEDULERS,
+    MAX_SMS,
     MAX_SUBSLICES,
     MAX_WARPS,
+    MAX_WAYS,
     NEVER,
     NUM_REASONS,
 )
@@ -37,11 +40,6 @@ from traces.errors import InputError
 
 _FIRST_POOL = 1 << 14
 _FIRST_DRAWS = 1 << 15
-
-
-def power_of_two(number: int) -> int:
-    """The least power of two that is not below `number`."""
-    return 1 << max(0, number - 1).bit_length()
 
 
 def _log2(number: int) -> int:
@@ -64,6 +62,7 @@ def check_timing(gpu: Gpu, fetch_path: str) -> None:
         raise InputError(f"{gpu.name}: timing needs the tables {', '.join(missing)}")
     assert gpu.sm_timing and gpu.l1_timing and gpu.dram_timing
     limits = (
+        ("sm.count", gpu.sm.count, MAX_SMS),
         ("sm.max_warps", gpu.sm.max_warps, MAX_WARPS),
         ("sm_timing.num_schedulers", gpu.sm_timing.num_schedulers, MAX_SCHEDULERS),
         ("sm_timing.memory_queue", gpu.sm_timing.memory_queue, MAX_MEMORY_QUEUE),
@@ -85,6 +84,10 @@ def check_timing(gpu: Gpu, fetch_path: str) -> None:
                 f"{gpu.name}: {name}.replacement = {level.replacement!r}: timing allows lru, fifo"
             )
         timing = getattr(gpu, f"{name}_timing")
+        if level is not None and level.ways > MAX_WAYS:
+            raise InputError(
+                f"{gpu.name}: {name}.ways = {level.ways}: timing allows up to {MAX_WAYS}"
+            )
         if level is not None and timing.miss_queue < 2:
             raise InputError(
                 f"{gpu.name}: {name}_timing.miss_queue = {timing.miss_queue}: timing needs 2 or "
@@ -182,23 +185,30 @@ def _tags(
     timing: Any,
     core_hz: int,
     num_groups: int,
+    parts: int = 1,
 ) -> Tags:
-    """The empty arrays of one level; of nothing where the level is absent."""
+    """The empty arrays of one level; of nothing where the level is absent. parts: sectors of this
+    level in one packet.
+    """
     if level is None:
         none = np.zeros(0, np.int32)
         return Tags(
             np.zeros(1, records.LEVEL), np.zeros(0, records.NODE), np.zeros(0, records.LINE),
             none.view(np.uint32), none, np.zeros(0, records.SET), none, np.zeros(0, records.MSHR),
             none, np.zeros((0, 256), np.uint32), np.zeros((num_groups, NUM_COUNTERS), np.int64),
-            np.zeros((2, 6), np.int64), np.zeros((1, 6, 1), np.int32),
+            np.zeros((2, 6), np.int64), np.zeros((1, 5, 1), np.int32),
+            np.zeros((1, 1), records.WAITING),
         )  # fmt: skip
-    if isinstance(timing, CacheTiming):
-        widest = max(timing.queue_in, timing.queue_down, timing.queue_fill, timing.queue_out)
-        latency = max(timing.latency_cycles, 1)
-        room = power_of_two(8 * (widest + latency) + timing.miss_queue + 64)
-    else:
-        room = power_of_two(timing.miss_queue + 32)
     rules = _level_rules(index, level, instances, timing, core_hz)
+    # Rings stay small: their places are used in turn, and would fill the host's cache.
+    most, delayed = timing.miss_queue, 1
+    if isinstance(timing, CacheTiming):
+        queues = (timing.queue_in, timing.queue_down, timing.queue_fill, timing.queue_out)
+        most = max(most, *queues)
+        latency = max(int(rules[0]["latency"]), int(rules[0]["texture_latency"]))
+        width = int(rules[0]["width"])
+        delayed = timing.queue_in + width * parts * (latency + 4)
+    room = power_of_two(most + 64)
     lines = instances * level.num_sets * level.ways
     mshrs = instances * timing.num_mshrs
     tags = Tags(
@@ -214,7 +224,8 @@ def _tags(
         set_hash(level).table,
         np.zeros((num_groups, NUM_COUNTERS), np.int64),
         np.zeros((2, 6), np.int64),
-        np.zeros((instances, 6, room), np.int32),
+        np.zeros((instances, 5, room), np.int32),
+        np.zeros((instances, power_of_two(delayed)), records.WAITING),
     )
     free = np.arange(mshrs, dtype=np.int32).reshape(instances, timing.num_mshrs)
     following = free + 1
@@ -232,11 +243,12 @@ def forget_lines(tags: Tags) -> None:
     """Empty every line of a level."""
     ways = int(tags.level[0]["ways"])
     line = np.arange(len(tags.lines), dtype=np.int32)
+    way = line % ways
     tags.lines["key"] = -NEVER
     tags.lines["set"] = line // ways
     # Way 0 is the first to be given up.
-    tags.lines["newer"] = np.where(line % ways == ways - 1, -1, line + 1)
-    tags.lines["older"] = np.where(line % ways == 0, -1, line - 1)
+    tags.lines["newer"] = np.where(way == ways - 1, -1, way + 1)
+    tags.lines["older"] = way - 1
     for field in ("valid", "partial", "modified", "reserved"):
         tags.lines[field] = 0
     tags.sets["newest"] = np.arange(len(tags.sets)) * ways + ways - 1
@@ -256,25 +268,6 @@ def _route(level: L2 | None) -> Route:
     ]  # fmt: skip
     size = _FIRST_DRAWS if part.hash.kind == RANDOM else 1
     return Route(np.array(numbers, np.int64), part.hash.table, new_draws(size))
-
-
-def _network(
-    inputs: int, outputs: int, input_packets: int, output_packets: int, latency: int, slack: int
-) -> Network:
-    in_room, out_room = power_of_two(input_packets + slack), power_of_two(output_packets + slack)
-    network = Network(
-        np.zeros(inputs, records.PORT),
-        np.zeros((inputs, in_room), np.int32),
-        np.zeros((inputs, in_room), np.int64),
-        np.zeros((inputs, in_room), np.int32),
-        np.zeros((inputs, in_room), np.int32),
-        np.zeros(outputs, records.OUTLET),
-        np.zeros((outputs, out_room), np.int32),
-        np.zeros((outputs, out_room), np.int64),
-        np.array([0, latency], np.int64),
-    )
-    network.outputs["stamp"] = -1
-    return network
 
 
 def _address_bits(address_map: str) -> npt.NDArray[np.int64]:
@@ -389,7 +382,10 @@ def build(gpu: Gpu, fetch_path: str, num_groups: int) -> State:
     tags = [
         _tags(records.L1, l1, num_sms * units, l1_timing, gpu.clock_hz, num_groups),
         _tags(records.GL1, gpu.gl1, num_gl1, gpu.gl1_timing, gpu.clock_hz, num_groups),
-        _tags(records.L2, gpu.l2, gpu.l2.num_slices, gpu.l2_timing, gpu.clock_hz, num_groups),
+        _tags(
+            records.L2, gpu.l2, gpu.l2.num_slices, gpu.l2_timing, gpu.clock_hz, num_groups,
+            line_parts,
+        ),
         _tags(
             records.LLC, gpu.llc, gpu.llc.num_slices if gpu.llc else 0, gpu.llc_timing,
             gpu.clock_hz, num_groups,
@@ -428,7 +424,9 @@ def build(gpu: Gpu, fetch_path: str, num_groups: int) -> State:
     slack = 8 * (num_sms + gpu.l2.num_slices) if icnt.queueing == "output-queued" else 8
     return State(
         Pool(
-            np.zeros(pool_size, records.REQUEST), np.arange(pool_size, dtype=np.int32), machine,
+            records.zeros(pool_size, records.REQUEST),
+            np.arange(pool_size, dtype=np.int32),
+            machine,
             np.tile(np.array([0, 0, NEVER], np.int64), (4, 1)),
         ),
         empty_work(),
@@ -440,18 +438,21 @@ def build(gpu: Gpu, fetch_path: str, num_groups: int) -> State:
         tags[1],
         tags[2],
         tags[3],
-        _network(
-            ports, gpu.l2.num_slices, icnt.input_packets, icnt.output_packets,
-            icnt.request_latency_cycles, slack,
+        new_network(
+            ports, gpu.l2.num_slices, icnt.input_packets + slack, icnt.output_packets + slack,
+            icnt.request_latency_cycles,
         ),
-        _network(
-            gpu.l2.num_slices, ports, icnt.input_packets, icnt.output_packets,
-            icnt.reply_latency_cycles, slack,
+        new_network(
+            gpu.l2.num_slices, ports, icnt.input_packets + slack, icnt.output_packets + slack,
+            icnt.reply_latency_cycles,
         ),
         _route(gpu.l2),
         _route(gpu.llc),
         _memory(gpu, last.num_channels),
-        np.zeros((num_sms * units * l1_timing.num_banks, power_of_two(latency + 1)), np.int32),
+        np.zeros(
+            (num_sms * units * l1_timing.num_banks, power_of_two(latency + 1)), records.WAITING
+        ),
+        (np.arange(num_sms * units) // units // int(machine[0]["sms_per_gl1"])).astype(np.int32),
         np.zeros((num_sms * units, power_of_two(icnt.response_packets + 1)), np.int32),
         np.zeros((num_sms, power_of_two(icnt.ejection_packets + 64)), np.int32),
         np.full((num_sms, 1), -1, np.int64),
@@ -469,8 +470,8 @@ def empty_work() -> Work:
     """No program, no rows."""
     return Work(
         np.zeros(0, records.INSTRUCTION), np.zeros(0, records.OPERATION),
-        np.zeros(1, records.ROW), np.zeros(1, np.int64), np.zeros(1, np.uint8),
-        np.zeros(1, np.int32), np.zeros(1, np.int64), np.zeros(1, np.uint32),
+        np.zeros(1, records.ROW), np.zeros(1, records.ASK), np.zeros(1, np.int64),
+        np.zeros(1, np.uint32),
         np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0, np.uint8),
     )  # fmt: skip
 
@@ -492,7 +493,7 @@ def with_more_room(state: State) -> State:
     if pool.machine[0]["free_top"] >= pool.machine[0]["num_pool"]:
         return state
     old = len(pool.requests)
-    requests = np.zeros(2 * old, records.REQUEST)
+    requests = records.zeros(2 * old, records.REQUEST)
     requests[:old] = pool.requests
     free = np.zeros(2 * old, np.int32)
     top = int(pool.machine[0]["free_top"])

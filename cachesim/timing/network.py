@@ -13,38 +13,74 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from cachesim.compiled import compiled
+from cachesim.compiled import compiled, small
+from cachesim.timing.bits import bit_at, lowest, power_of_two, without_lowest
+from cachesim.timing.records import NEVER, OUTLET, PACKET, PORT, WAITING
 
 
 class Network(NamedTuple):
-    """One direction. I inputs, O outputs.
+    """One direction. I inputs, O outputs, W and V 64-bit words with a bit each.
 
-    inputs: (I,) `records.PORT`, in_ring: (I, room) int32, in_time: (I, room) int64 cycle from which
-    a packet may move; in_out: (I, room) int32 its output, in_flits: (I, room) int32.
-    outputs: (O,) `records.OUTLET`, out_ring, out_time: (O, room); an output-queued one's `busy` is
-    in 1/256 cycles. scalars: (2,) int64, packets held at inputs, the latency.
+    inputs: (I,) `records.PORT`; in_ring: (I, room) `records.PACKET`. outputs: (O,)
+    `records.OUTLET`, an output-queued one's `busy` in 1/256 cycles; out_ring: (O, room)
+    `records.WAITING`. arrivals: (O,) int64 cycle from which an output's first packet may be taken,
+    `NEVER` without one. unready: (W,) uint64 inputs whose head may not move yet; wanted: (O, W)
+    uint64 inputs whose head may, by output; contested: (V,) uint64 outputs that an input wants.
+    scalars: (2,) int64, packets held at inputs, the latency.
     """
 
     inputs: npt.NDArray[np.void]
-    in_ring: npt.NDArray[np.int32]
-    in_time: npt.NDArray[np.int64]
-    in_out: npt.NDArray[np.int32]
-    in_flits: npt.NDArray[np.int32]
+    in_ring: npt.NDArray[np.void]
     outputs: npt.NDArray[np.void]
-    out_ring: npt.NDArray[np.int32]
-    out_time: npt.NDArray[np.int64]
+    out_ring: npt.NDArray[np.void]
+    arrivals: npt.NDArray[np.int64]
+    unready: npt.NDArray[np.uint64]
+    wanted: npt.NDArray[np.uint64]
+    contested: npt.NDArray[np.uint64]
     scalars: npt.NDArray[np.int64]
 
 
 AT_INPUTS, LATENCY = range(2)
+U64 = np.uint64
 
 
-@compiled
+def new_network(
+    inputs: int, outputs: int, input_packets: int, output_packets: int, latency: int
+) -> Network:
+    """An empty network with room for so many packets at each input and output."""
+    words = (inputs + 63) // 64
+    return Network(
+        np.zeros(inputs, PORT),
+        np.zeros((inputs, power_of_two(input_packets)), PACKET),
+        np.zeros(outputs, OUTLET),
+        np.zeros((outputs, power_of_two(output_packets)), WAITING),
+        np.full(outputs, NEVER, np.int64),
+        np.zeros(words, np.uint64),
+        np.zeros((outputs, words), np.uint64),
+        np.zeros((outputs + 63) // 64, np.uint64),
+        np.array([0, latency], np.int64),
+    )
+
+
+@small
 def has_room(machine, net, source, output):  # type: ignore[no-untyped-def]
     """Whether a packet may enter."""
     if machine.output_queued:
         return net.outputs[output].count < machine.output_packets
-    return net.inputs[source].in_count < machine.input_packets
+    return net.inputs[source].count < machine.input_packets
+
+
+@small
+def _arrive(net, output, request, time, entered):  # type: ignore[no-untyped-def]
+    """Queue a packet at an output."""
+    outlet = net.outputs[output]
+    place = net.out_ring[output, (outlet.head + outlet.count) & (net.out_ring.shape[1] - 1)]
+    place.request = request
+    place.time = time
+    place.entered = entered
+    if outlet.count == 0:
+        net.arrivals[output] = time
+    outlet.count += 1
 
 
 @compiled
@@ -53,40 +89,77 @@ def push(machine, net, source, output, request, payload_bytes, time):  # type: i
     size = payload_bytes + machine.header_bytes
     if machine.output_queued:
         outlet = net.outputs[output]
-        room = net.out_ring.shape[1] - 1
         outlet.busy = max(time * 256, outlet.busy) + max(1, size * 256 // machine.flit_bytes)
-        at = (outlet.head + outlet.count) & room
-        net.out_ring[output, at] = request
-        net.out_time[output, at] = (outlet.busy + 255) // 256 + net.scalars[LATENCY]
-        outlet.count += 1
+        arrives = (outlet.busy + 255) // 256 + net.scalars[LATENCY]
+        _arrive(net, output, request, arrives, machine.now)
         return
-    flits = (size + machine.flit_bytes - 1) // machine.flit_bytes
     port = net.inputs[source]
-    room = net.in_ring.shape[1] - 1
-    at = (port.in_head + port.in_count) & room
-    net.in_ring[source, at] = request
-    net.in_time[source, at] = time
-    net.in_out[source, at] = output
-    net.in_flits[source, at] = flits
-    port.in_count += 1
+    place = net.in_ring[source, (port.head + port.count) & (net.in_ring.shape[1] - 1)]
+    place.request = request
+    place.time = time
+    place.entered = machine.now
+    place.output = output
+    place.flits = (size + machine.flit_bytes - 1) // machine.flit_bytes
+    if port.count == 0:
+        net.unready[source >> 6] |= bit_at(source & 63)
+    port.count += 1
     net.scalars[AT_INPUTS] += 1
 
 
-@compiled
+@small
 def _offer(net, source, now):  # type: ignore[no-untyped-def]
-    """Put an input on the list of those whose head wants an output."""
+    """Let the head of an input that is not ready ask for its output, if it may move by now."""
     port = net.inputs[source]
-    at = port.in_head & (net.in_ring.shape[1] - 1)
-    if port.in_count == 0 or net.in_time[source, at] > now or port.in_busy > now:
-        return -1
-    output = net.in_out[source, at]
+    head = net.in_ring[source, port.head & (net.in_ring.shape[1] - 1)]
+    if head.time > now or port.busy > now:
+        return
+    word, bit = source >> 6, bit_at(source & 63)
+    net.unready[word] &= ~bit
+    net.wanted[head.output, word] |= bit
+    net.contested[head.output >> 6] |= bit_at(head.output & 63)
+
+
+@small
+def _next_in_turn(net, output, turn):  # type: ignore[no-untyped-def]
+    """The first input from `turn` on, around, that wants an output which some input wants."""
+    words = net.wanted.shape[1]
+    word = turn >> 6
+    after = net.wanted[output, word] & ~(bit_at(turn & 63) - U64(1))
+    for _ in range(words):
+        if after != 0:
+            return (word << 6) + lowest(after)
+        word = word + 1 if word + 1 < words else 0
+        after = net.wanted[output, word]
+    return (word << 6) + lowest(after)
+
+
+@compiled
+def _move(machine, net, output, now):  # type: ignore[no-untyped-def]
+    """Move the packet of the input whose turn it is to an output."""
     outlet = net.outputs[output]
-    if outlet.stamp != now:
-        outlet.stamp = now
-        outlet.first = -1
-    port.candidate = outlet.first
-    outlet.first = source
-    return output
+    best = _next_in_turn(net, output, outlet.turn)
+    port = net.inputs[best]
+    head = net.in_ring[best, port.head & (net.in_ring.shape[1] - 1)]
+    flits = np.int64(head.flits)
+    _arrive(net, output, head.request, now + flits + net.scalars[LATENCY], head.entered)
+    outlet.busy = now + flits
+    outlet.turn = best + 1 if best + 1 < len(net.inputs) else 0
+    word, bit = best >> 6, bit_at(best & 63)
+    net.wanted[output, word] &= ~bit
+    others = U64(0)
+    for k in range(net.wanted.shape[1]):
+        others |= net.wanted[output, k]
+    if others == 0:
+        net.contested[output >> 6] &= ~bit_at(output & 63)
+    port.count -= 1
+    port.head = (port.head + 1) & (net.in_ring.shape[1] - 1) if port.count > 0 else 0
+    net.scalars[AT_INPUTS] -= 1
+    if flits > 1:
+        port.busy = now + flits
+    if port.count > 0:
+        net.unready[word] |= bit
+        if flits == 1 and machine.match_again:
+            _offer(net, best, now)
 
 
 @compiled
@@ -94,62 +167,38 @@ def transfer(machine, net, now):  # type: ignore[no-untyped-def]
     """One cycle of the crossbar: match heads to outputs, and move what was matched."""
     if net.scalars[AT_INPUTS] == 0:
         return
-    num_inputs, num_outputs = len(net.inputs), len(net.outputs)
-    offered = 0
-    for source in range(num_inputs):
-        if net.inputs[source].in_count > 0:
-            offered += _offer(net, source, now) >= 0
-    if offered == 0:
-        return
-    in_room, out_room = net.in_ring.shape[1] - 1, net.out_ring.shape[1] - 1
-    for output in range(num_outputs):
-        outlet = net.outputs[output]
-        if outlet.stamp != now or outlet.first < 0:
-            continue
-        if outlet.count >= machine.output_packets or outlet.busy > now:
-            continue
-        best, nearest = -1, num_inputs
-        source = outlet.first
-        while source >= 0:
-            distance = source - outlet.turn
-            if distance < 0:
-                distance += num_inputs
-            if distance < nearest:
-                best, nearest = source, distance
-            source = net.inputs[source].candidate
-        port = net.inputs[best]
-        at = port.in_head & in_room
-        flits = net.in_flits[best, at]
-        place = (outlet.head + outlet.count) & out_room
-        net.out_ring[output, place] = net.in_ring[best, at]
-        net.out_time[output, place] = now + flits + net.scalars[LATENCY]
-        outlet.count += 1
-        outlet.busy = now + flits
-        outlet.turn = best + 1 if best + 1 < num_inputs else 0
-        port.in_head = (port.in_head + 1) & in_room
-        port.in_count -= 1
-        net.scalars[AT_INPUTS] -= 1
-        if flits > 1:
-            port.in_busy = now + flits
-        elif machine.match_again:
-            _offer(net, best, now)
+    for word in range(len(net.unready)):
+        left = net.unready[word]
+        while left != 0:
+            _offer(net, (word << 6) + lowest(left), now)
+            left = without_lowest(left)
+    for word in range(len(net.contested)):
+        # An input that has moved a packet may ask for a later output in the same cycle.
+        later = ~U64(0)
+        while net.contested[word] & later != 0:
+            place = lowest(net.contested[word] & later)
+            later = ~U64(1) << U64(place)
+            output = (word << 6) + place
+            outlet = net.outputs[output]
+            if outlet.count < machine.output_packets and outlet.busy <= now:
+                _move(machine, net, output, now)
 
 
-@compiled
+@small
 def arrival(net, output):  # type: ignore[no-untyped-def]
-    """The cycle from which an output's first packet may be taken; `NEVER`-like if there is none."""
-    outlet = net.outputs[output]
-    if outlet.count == 0:
-        return np.int64(1 << 62)
-    return net.out_time[output, outlet.head & (net.out_ring.shape[1] - 1)]
+    """The cycle from which an output's first packet may be taken; `NEVER` if there is none."""
+    return net.arrivals[output]
 
 
-@compiled
+@small
 def pop(net, output):  # type: ignore[no-untyped-def]
-    """Take an output's first packet."""
+    """Take an output's first packet. Returns (its request, when it entered modulo 2^32)."""
     outlet = net.outputs[output]
     room = net.out_ring.shape[1] - 1
-    request = net.out_ring[output, outlet.head & room]
-    outlet.head = (outlet.head + 1) & room
+    first = net.out_ring[output, outlet.head & room]
+    request, entered = first.request, first.entered
     outlet.count -= 1
-    return request
+    # An empty ring starts over: places in use stay in the host's cache.
+    outlet.head = (outlet.head + 1) & room if outlet.count > 0 else 0
+    net.arrivals[output] = NEVER if outlet.count == 0 else net.out_ring[output, outlet.head].time
+    return request, entered

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cachesim.address import RANDOM, slice_and_line
-from cachesim.compiled import compiled
+from cachesim.compiled import compiled, small
 
 U64 = np.uint64
 #: Places in `Route.draws` before its hash table: how many runs were drawn, the generator's next
@@ -50,11 +50,12 @@ def larger_draws(draws: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
     return larger
 
 
-@compiled
+@small
 def _slot(draws, run):  # type: ignore[no-untyped-def]
     """Where a run stands in the table, or would stand."""
     mask = (len(draws) - TABLE) // 2 - 1
-    at = ((run * 0x1E3779B97F4A7C15) >> 24) & mask
+    # Eight neighbours stand together.
+    at = ((((run >> 3) * 0x1E3779B97F4A7C15) >> 24 << 3) | (run & 7)) & mask
     while draws[TABLE + 2 * at] >= 0 and draws[TABLE + 2 * at] != run:
         at = (at + 1) & mask
     return TABLE + 2 * at
@@ -92,11 +93,10 @@ def _drawn(route, address):  # type: ignore[no-untyped-def]
     return route.draws[at + 1]
 
 
-@compiled
-def touch_address(route, address):  # type: ignore[no-untyped-def]
-    """Draw an address's slice if nobody asked for it before."""
-    if route.numbers[3] == RANDOM:
-        _drawn(route, address)
+@small
+def is_drawn(route):  # type: ignore[no-untyped-def]
+    """Whether slices are drawn at an address's first touch."""
+    return route.numbers[3] == RANDOM
 
 
 @compiled
@@ -119,7 +119,7 @@ def locate(route, address):  # type: ignore[no-untyped-def]
     return np.int64(where), np.int64(number)
 
 
-@compiled
+@small
 def is_filling_table(draws):  # type: ignore[no-untyped-def]
     """Whether a table of draws is half full."""
     return draws[DRAWN] * 4 > len(draws) - TABLE

@@ -12,19 +12,29 @@ from __future__ import annotations
 
 import numpy as np
 
-from cachesim.compiled import compiled
+from cachesim.compiled import compiled, small
 from cachesim.counts import REQUESTS
 from cachesim.stream import ATOMIC, LOAD, STORE
 from cachesim.timing import fifo
-from cachesim.timing.access import MISSES, access, count_bypass, drop_request, fill, take_request
+from cachesim.timing.access import (
+    MISSES,
+    access,
+    count_bypass,
+    drop_request,
+    fill,
+    since,
+    take_request,
+)
 from cachesim.timing.network import has_room, push
-from cachesim.timing.partition import locate, touch_address
+from cachesim.timing.partition import is_drawn, locate
 from cachesim.timing.records import (
     DEMANDED,
     FAIL,
     HIT,
     MAX_WARPS,
     NEVER,
+    NO_OTHER,
+    NO_QUEUE,
     PATH_BYPASS,
     PATH_FIFO,
     R_INTERCONNECT,
@@ -32,10 +42,13 @@ from cachesim.timing.records import (
     R_L1_RESERVATION,
 )
 from cachesim.timing.slice import arrive
-from cachesim.timing.tags import next_ready
+from cachesim.timing.tags import bucket_of, next_ready
+from cachesim.timing.view import prefetch
 from cachesim.timing.warp import sector_back, store_done
 
 U64 = np.uint64
+#: How far ahead of the pipe the host fetches what it asks for.
+_ASKS_AHEAD = 4
 MAX_ADDRESS = (1 << 63) - 1
 
 
@@ -45,13 +58,14 @@ def send_up(state, request):  # type: ignore[no-untyped-def]
     machine = state.pool.machine[0]
     one = state.pool.requests[request]
     if machine.has_gl1:
-        node = state.gl1.nodes[one.port]
+        port = state.port_of[one.unit]
+        node = state.gl1.nodes[port]
         level = state.gl1.level[0]
         if node.delay_count + node.in_count >= level.queue_in:
             return False
-        arrive(state.gl1, state.pool, one.port, request, machine.now + 1 + level.latency)
-        one.mark = machine.now
-        node.wake = min(node.wake, one.ready)
+        ready = machine.now + 1 + level.latency
+        arrive(state.gl1, port, request, ready, machine.now)
+        node.wake = min(node.wake, ready)
         return True
     return inject(state, request, machine.now + 1)
 
@@ -61,33 +75,32 @@ def inject(state, request, time):  # type: ignore[no-untyped-def]
     """Put a request into the request network; False where there is no room."""
     machine = state.pool.machine[0]
     one = state.pool.requests[request]
-    where, number = locate(state.l2_route, one.address)
-    if not has_room(machine, state.up, one.port, where):
+    if one.slice < 0:
+        one.slice, one.number = locate(state.l2_route, one.address)
+    where, port = one.slice, state.port_of[one.unit]
+    if not has_room(machine, state.up, port, where):
         return False
-    one.slice = where
-    one.number = number
-    one.mark = machine.now
     payload = machine.store_bytes if one.write else 0
-    push(machine, state.up, one.port, where, request, payload, time)
+    push(machine, state.up, port, where, request, payload, time)
     if machine.output_queued:
         node = state.l2.nodes[where]
         node.wake = min(node.wake, time)
     return True
 
 
-@compiled
+@small
 def _returned(state, request):  # type: ignore[no-untyped-def]
     """Book a sector that reached its register, and forget its request."""
     machine = state.pool.machine[0]
     one = state.pool.requests[request]
-    took = machine.now - one.born
+    took = since(one.born, machine.now)
     state.latency[one.source, 0] += took
     state.latency[one.source, 1] += 1
     sector_back(state, one.warp, one.load)
     drop_request(state.pool, request)
 
 
-@compiled
+@small
 def _write_back(state, unit):  # type: ignore[no-untyped-def]
     """Write one sector to the registers, and choose the next client: texture, bypassed or L1.
     Returns whether there is one.
@@ -133,7 +146,7 @@ def _respond(state, unit):  # type: ignore[no-untyped-def]
     elif one.path == PATH_BYPASS:
         if pipe.next_global >= 0:
             return False
-        if one.parent >= 0:
+        if one.is_part:
             parent = one.parent
             drop_request(state.pool, request)
             state.pool.requests[parent].pending -= 1
@@ -147,12 +160,12 @@ def _respond(state, unit):  # type: ignore[no-untyped-def]
             return False
         node.fill_time = max(node.fill_time, machine.now * 256) + state.l1.level[0].fill_cost
         fill(state.l1, state.pool, unit, request, machine.now)
-    pipe.response_head = (pipe.response_head + 1) & room
     pipe.response_count -= 1
+    pipe.response_head = (pipe.response_head + 1) & room if pipe.response_count > 0 else 0
     return True
 
 
-@compiled
+@small
 def _drain_misses(state, unit):  # type: ignore[no-untyped-def]
     """Send the oldest miss on. Returns whether it could."""
     node = state.l1.nodes[unit]
@@ -166,6 +179,20 @@ def _drain_misses(state, unit):  # type: ignore[no-untyped-def]
     node.miss_count -= 1
     node.version += 1
     return True
+
+
+@small
+def _may_succeed(state, pipe, node, bank):  # type: ignore[no-untyped-def]
+    """Whether something has changed that a failed look-up waits for."""
+    if pipe.bank_failed[bank] == node.version:
+        return False
+    reason = pipe.bank_reason[bank]
+    if reason == NO_OTHER or pipe.bank_filled[bank] != node.num_filled:
+        return True
+    level = state.l1.level[0]
+    if reason == NO_QUEUE:
+        return node.miss_count + 1 < level.miss_queue
+    return node.mshr_used < level.num_mshrs or pipe.bank_taken[bank] != node.num_taken
 
 
 @compiled
@@ -182,15 +209,19 @@ def _look_up(state, unit):  # type: ignore[no-untyped-def]
             continue
         if pipe.bank_ready[bank] > now:
             continue
-        if pipe.bank_failed[bank] == node.version:
+        if pipe.bank_failed[bank] >= 0 and not _may_succeed(state, pipe, node, bank):
             state.l1.outcomes[pipe.bank_write[bank], FAIL] += 1
             pipe.blocked = R_L1_RESERVATION
             continue
-        request = state.banks[unit * machine.num_banks + bank, pipe.bank_head[bank] & room]
+        at = unit * machine.num_banks + bank
+        request = state.banks[at, pipe.bank_head[bank] & room].request
         one = state.pool.requests[request]
         outcome, sent = access(state.l1, state.pool, unit, request, now)
         if outcome == FAIL:
             pipe.bank_failed[bank] = node.version
+            pipe.bank_reason[bank] = node.fail_reason
+            pipe.bank_filled[bank] = node.num_filled
+            pipe.bank_taken[bank] = node.num_taken
             pipe.bank_write[bank] = one.write
             pipe.blocked = R_L1_RESERVATION
             continue
@@ -199,10 +230,14 @@ def _look_up(state, unit):  # type: ignore[no-untyped-def]
         pipe.bank_count[bank] -= 1
         pipe.in_banks -= 1
         if pipe.bank_count[bank] > 0:
-            following = state.banks[unit * machine.num_banks + bank, pipe.bank_head[bank] & room]
-            pipe.bank_ready[bank] = state.pool.requests[following].ready
+            following = state.banks[at, pipe.bank_head[bank] & room]
+            pipe.bank_ready[bank] = following.time
+            # It is looked up in a later cycle; until then the host fetches what that needs.
+            prefetch(state.pool.requests, following.request)  # type: ignore[call-arg]
+            prefetch(state.l1.buckets, following.entered)
         if one.operation == STORE:
             node.version += 1
+            node.num_filled += 1
             if not sent:
                 store_done(state, one.warp)
                 drop_request(state.pool, request)
@@ -212,7 +247,7 @@ def _look_up(state, unit):  # type: ignore[no-untyped-def]
             node.version += 1
 
 
-@compiled
+@small
 def _new_request(state, unit, address, at, sector):  # type: ignore[no-untyped-def]
     """A request for one sector of the instruction the pipe works on."""
     machine = state.pool.machine[0]
@@ -224,23 +259,22 @@ def _new_request(state, unit, address, at, sector):  # type: ignore[no-untyped-d
     one.warp = pipe.warp
     one.load = pipe.load
     one.unit = unit
-    one.group = state.work.group[at]
+    one.group = state.work.asks[at].group
     one.operation = instruction.operation
     one.write = 1 if instruction.operation == STORE else 0
     one.kind = DEMANDED
     one.path = pipe.path
     one.born = machine.now
     one.mark = machine.now
-    sm = unit // machine.units
-    one.port = sm // machine.sms_per_gl1 if machine.has_gl1 else sm
-    one.bytes = 0
+    one.slice = pipe.slice
+    one.number = pipe.number
     if one.write:
         where = state.work.written[at] + sector
         one.bytes = state.work.granules[where & (len(state.work.granules) - 1)]
     return index
 
 
-@compiled
+@small
 def _highest(mask):  # type: ignore[no-untyped-def]
     sector = 7
     while (mask >> sector) & 1 == 0:
@@ -248,7 +282,7 @@ def _highest(mask):  # type: ignore[no-untyped-def]
     return sector
 
 
-@compiled
+@small
 def _out_of_bandwidth(pipe):  # type: ignore[no-untyped-def]
     """Note why the instruction is not done, and that it is not."""
     if pipe.blocked == 0:
@@ -277,20 +311,26 @@ def _issue_accesses(state, unit):  # type: ignore[no-untyped-def]
                     return _out_of_bandwidth(pipe)
                 lines += 1
             pipe.at -= 1
-            pipe.mask = work.mask[pipe.at & machine.request_mask]
+            prefetch(work.asks, (pipe.at - _ASKS_AHEAD) & machine.request_mask)  # type: ignore[call-arg]
+            pipe.mask = work.asks[pipe.at & machine.request_mask].mask
             if pipe.path != PATH_BYPASS:
-                state.l1.counters[work.group[pipe.at & machine.request_mask], REQUESTS] += 1
+                state.l1.counters[work.asks[pipe.at & machine.request_mask].group, REQUESTS] += 1
         if pipe.mask == 0:
             break
         at = pipe.at & machine.request_mask
         sector = _highest(pipe.mask)
         # The highest address bit is dropped: the engine's addresses are signed.
-        address = (work.line[at] << level.line_shift) + (sector << level.sector_shift)
+        address = (work.asks[at].line << level.line_shift) + (sector << level.sector_shift)
         address &= MAX_ADDRESS
+        if not pipe.is_located:
+            # What goes around the L1 asks where at once; a random slice is drawn at first touch.
+            pipe.is_located = 1
+            pipe.slice = -1
+            if pipe.path == PATH_BYPASS or (pipe.path == 0 and is_drawn(state.l2_route)):
+                pipe.slice, pipe.number = locate(state.l2_route, address)
         if pipe.path == PATH_BYPASS:
-            where, _number = locate(state.l2_route, address)
-            source = unit // machine.units
-            if not machine.has_gl1 and not has_room(machine, state.up, source, where):
+            port = state.port_of[unit]
+            if not machine.has_gl1 and not has_room(machine, state.up, port, pipe.slice):
                 pipe.blocked = R_INTERCONNECT
                 return False
             index = _new_request(state, unit, address, at, sector)
@@ -298,7 +338,9 @@ def _issue_accesses(state, unit):  # type: ignore[no-untyped-def]
                 drop_request(state.pool, index)
                 pipe.blocked = R_INTERCONNECT
                 return False
-            count_bypass(state.l1, work.group[at], state.pool.requests[index].operation != LOAD)
+            count_bypass(
+                state.l1, work.asks[at].group, state.pool.requests[index].operation != LOAD
+            )
         elif pipe.path == PATH_FIFO:
             if not fifo.accepts(state, unit):
                 pipe.blocked = R_L1_RESERVATION
@@ -307,22 +349,24 @@ def _issue_accesses(state, unit):  # type: ignore[no-untyped-def]
             fifo.access(state, unit, index)
         else:
             bank = (address >> machine.bank_shift) & (machine.num_banks - 1)
-            touch_address(state.l2_route, address)
             if machine.lines_per_cycle > 0:
                 bank = k
             if pipe.bank_count[bank] >= machine.l1_latency or pipe.bank_entered[bank] == now:
                 machine.bank_conflicts += 1
                 return _out_of_bandwidth(pipe)
             index = _new_request(state, unit, address, at, sector)
-            state.pool.requests[index].ready = now + machine.l1_latency
             place = (pipe.bank_head[bank] + pipe.bank_count[bank]) & room
-            state.banks[unit * machine.num_banks + bank, place] = index
+            waiting = state.banks[unit * machine.num_banks + bank, place]
+            waiting.request = index
+            waiting.time = now + machine.l1_latency
+            waiting.entered = bucket_of(state.l1, unit, work.asks[at].line)
             if pipe.bank_count[bank] == 0:
                 pipe.bank_ready[bank] = now + machine.l1_latency
             pipe.bank_count[bank] += 1
             pipe.bank_entered[bank] = now
             pipe.in_banks += 1
         pipe.mask &= ~(1 << sector)
+        pipe.is_located = 0
         pipe.left -= 1
     return pipe.left <= 0 or _out_of_bandwidth(pipe)
 
@@ -363,28 +407,30 @@ def _take_instruction(state, index, unit):  # type: ignore[no-untyped-def]
         at = sm.queue_head[s]
         if (
             machine.units > 1
-            and (sm.queue_warp[s, at] // 2) % machine.units != unit % machine.units
+            and (sm.queue_warp[at, s] // 2) % machine.units != unit % machine.units
         ):
             continue
-        time = sm.queue_time[s, at]
+        time = sm.queue_time[at, s]
         if time < oldest:
             best, oldest = s, time
     if best < 0:
         return
     at = sm.queue_head[best]
-    slot = sm.queue_warp[best, at]
+    slot = sm.queue_warp[at, best]
     sm.queue_head[best] = at + 1 if at + 1 < machine.memory_queue else 0
     sm.queue_count[best] -= 1
+    sm.collect_from = 0
+    sm.is_stuck = 0
     pipe.warp = index * MAX_WARPS + slot
     # The queue keeps the row beside the slot: the warp itself has moved on.
-    row = state.work.rows[sm.queue_row[best, at] & machine.row_mask]
+    row = state.work.rows[sm.queue_row[at, best] & machine.row_mask]
     instruction = state.work.instructions[row.code]
     pipe.code = row.code
     pipe.first = row.first
     pipe.at = row.first + row.count
     pipe.mask = 0
     pipe.left = row.sectors
-    pipe.load = sm.queue_load[best, at]
+    pipe.load = sm.queue_load[at, best]
     pipe.path = instruction.path
     if instruction.operation == ATOMIC:
         pipe.path = PATH_BYPASS

@@ -6,7 +6,10 @@ them bound the machine: `check_bounds` in `cachesim.timing.machine` refuses a la
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
+import numpy.typing as npt
 
 MAX_WARPS = 64
 MAX_SCHEDULERS = 8
@@ -16,6 +19,8 @@ MAX_DRAM_BANKS = 64
 MAX_MEMORY_QUEUE = 64
 MAX_COLLECTORS = 8
 MAX_SUBSLICES = 8
+MAX_WAYS = (1 << 15) - 1
+MAX_SMS = (1 << 15) // MAX_WARPS - 1
 #: Slots of the wheel that wakes warps: a power of two above every unit's latency.
 WHEEL = 512
 
@@ -38,6 +43,9 @@ L1, GL1, L2, LLC = range(4)
 HIT, HIT_RESERVED, MISS, SECTOR_MISS, FAIL, MSHR_HIT = range(6)
 OUTCOMES = ("HIT", "HIT_RESERVED", "MISS", "SECTOR_MISS", "RESERVATION_FAIL", "MSHR_HIT")
 
+# Why a look-up fails: no place in the miss queue, no MSHR, anything else.
+NO_QUEUE, NO_MSHR, NO_OTHER = range(3)
+
 # Reasons for a cycle of an SM, in the order of `results.REASONS`; MEMORY_WAIT is shared out over
 # interconnect, l2, dram and latency at the end.
 R_ISSUE, R_ARITHMETIC, R_L1_BANDWIDTH, R_L1_RESERVATION, R_INTERCONNECT, R_IDLE, R_MEMORY = range(7)
@@ -46,43 +54,67 @@ NUM_REASONS = 7
 # Stages between an L1 and its reply, whose times are summed.
 S_REQUEST, S_L2, S_BELOW, S_REPLY = range(4)
 
-REQUEST = np.dtype(
-    [
-        ("address", "i8"),  # of its sector
-        ("ready", "i8"),  # core cycle from which the queue it lies in may pass it on
-        ("born", "i8"),  # when it entered the load/store unit's hands
-        ("mark", "i8"),  # when it entered the present stage
-        ("number", "i8"),  # line number inside its L2 slice
-        ("next", "i4", (5,)),  # links of MSHR lists, one per level, and of DRAM's bank lists
-        ("parent", "i4"),  # the request it is a part of, or -1
-        ("pending", "i4"),  # parts that have not returned
-        ("warp", "i4"),  # sm * MAX_WARPS + slot, or -1
-        ("load", "i4"),  # which of the warp's loads
-        ("unit", "i4"),  # L1 unit
-        ("port", "i4"),  # of the interconnect, on the SMs' side
-        ("slice", "i4"),  # of the L2
-        ("group", "i4"),  # of counters
-        ("lower", "i4"),  # slice of the LLC, or memory channel
-        ("row", "i4"),
-        ("bytes", "u4"),  # granules a store covers
-        ("bank", "i2"),
-        ("operation", "u1"),  # `stream.LOAD` ...
-        ("path", "u1"),
-        ("kind", "u1"),
-        ("source", "u1"),  # the level its data came from: 0 L1, 1 GL1, 2 L2, 3 LLC, 4 DRAM
-        ("write", "u1"),
-        ("sectors", "u1"),  # L2 sectors of a texture line; 1 otherwise
-    ],
-    align=True,
+#: Bytes of a line of the host's own cache: what is used together should share one.
+_HOST_LINE = 64
+
+
+def _in_lines(*fields: Any) -> np.dtype[np.void]:
+    """A record of whole host lines, its fields packed in order."""
+    packed = np.dtype(list(fields))
+    offsets = [packed.fields[name][1] for name, *_ in fields]  # type: ignore[index]
+    size = -(-packed.itemsize // _HOST_LINE) * _HOST_LINE
+    return np.dtype(
+        {
+            "names": [name for name, *_ in fields],
+            "formats": [packed[name] for name, *_ in fields],
+            "offsets": offsets,
+            "itemsize": size,
+        }
+    )
+
+
+def zeros(count: int, dtype: np.dtype[np.void]) -> npt.NDArray[np.void]:
+    """(count,) records from the start of a host line."""
+    raw = np.zeros(count * dtype.itemsize + _HOST_LINE, np.uint8)
+    start = -raw.ctypes.data % _HOST_LINE
+    return raw[start : start + count * dtype.itemsize].view(dtype)
+
+
+REQUEST = _in_lines(
+    # One line: what every stage touches.
+    ("address", "i8"),  # of its sector
+    ("number", "i8"),  # line number inside its L2 slice
+    ("born", "u4"),  # when it entered the load/store unit's hands, modulo 2^32
+    ("mark", "u4"),  # when it entered the present stage, if the stage does not keep that itself
+    ("next", "i4", (5,)),  # links of MSHR lists, one per level, and of DRAM's bank lists
+    ("group", "i4"),  # of counters
+    ("load", "i4"),  # which of the warp's loads
+    ("warp", "i2"),  # sm * MAX_WARPS + slot, or -1
+    ("unit", "i2"),  # L1 unit
+    ("slice", "i2"),  # of the L2; -1 until it goes there
+    ("operation", "u1"),  # `stream.LOAD` ...
+    ("path", "u1"),
+    ("kind", "u1"),
+    ("source", "u1"),  # the level its data came from: 0 L1, 1 GL1, 2 L2, 3 LLC, 4 DRAM
+    ("write", "u1"),
+    ("is_part", "u1"),  # whether it has a parent
+    # The other line: what few touch.
+    ("parent", "i4"),  # the request it is a part of
+    ("pending", "i4"),  # parts that have not returned, where it has parts
+    ("lower", "i4"),  # slice of the LLC, or memory channel
+    ("row", "i4"),
+    ("bytes", "u4"),  # granules a store covers
+    ("bank", "i2"),
+    ("sectors", "u1"),  # L2 sectors that a texture line waits for
 )
 
 LINE = np.dtype(
     [
         ("key", "i8"),  # address >> line shift, -NEVER = never used
         ("chain", "i4"),  # next line of its hash bucket
-        ("newer", "i4"),  # neighbours in its set's order of use
-        ("older", "i4"),
         ("set", "i4"),
+        ("newer", "i2"),  # ways of its neighbours in its set's order of use, or -1
+        ("older", "i2"),
         ("valid", "u1"),  # sectors that can be read
         ("partial", "u1"),  # sectors some bytes of which were written
         ("modified", "u1"),
@@ -114,6 +146,9 @@ NODE = np.dtype(
         ("version", "i8"),  # counts what may turn a reservation fail into success
         ("failed", "i8"),  # version at which the head of the queue failed, or -1
         ("failed_write", "i8"),  # whether it is a store
+        ("fail_reason", "i8"),  # of the last look-up that failed
+        ("num_filled", "i8"),  # counts what may turn a miss into a hit
+        ("num_taken", "i8"),  # MSHRs taken so far
         ("delay_ready", "i8"),  # of the oldest request in the delay
         ("dirty_lines", "i8"),
         ("mshr_free", "i4"),
@@ -161,18 +196,22 @@ SM = np.dtype(
         ("num_resident", "i8"),
         ("num_blocked", "i8"),
         ("resident_since", "i8"),
+        # Until then, and until something new comes or room is made, stepping the collectors
+        # changes nothing.
+        ("collect_from", "i8"),
+        ("is_stuck", "i4"),  # whether nothing can issue until something changes
+        ("num_collecting", "i4"),
+        ("eject_head", "i4"),
+        ("eject_count", "i4"),
+        ("free_places", "i4"),
+        ("num_issued", "i4", (5,)),  # of each kind, not yet in a collector
         ("ready", "u8", (5,)),
         ("age", "i8", (MAX_WARPS,)),  # of the warp in each slot, the oldest least
         ("last_issued", "i4", (MAX_SCHEDULERS,)),
         ("unit_free", "i8", (MAX_SCHEDULERS, 4)),
         ("queue_head", "i4", (MAX_SCHEDULERS,)),
         ("queue_count", "i4", (MAX_SCHEDULERS,)),
-        ("queue_warp", "i4", (MAX_SCHEDULERS, MAX_MEMORY_QUEUE)),
-        ("queue_time", "i8", (MAX_SCHEDULERS, MAX_MEMORY_QUEUE)),
-        ("queue_row", "i8", (MAX_SCHEDULERS, MAX_MEMORY_QUEUE)),
         # GPGPU-Sim's operand collectors: issued[kind, scheduler], then collector[scheduler, unit].
-        ("num_collecting", "i4"),
-        ("num_issued", "i4", (5,)),  # of each kind, not yet in a collector
         ("issued_slot", "i4", (5, MAX_SCHEDULERS)),
         ("issued_order", "i8", (5, MAX_SCHEDULERS)),
         ("issued_chain", "i4", (5, MAX_SCHEDULERS)),
@@ -187,10 +226,11 @@ SM = np.dtype(
         ("collector_row", "i8", (MAX_SCHEDULERS, MAX_COLLECTORS)),
         ("collector_load", "i4", (MAX_SCHEDULERS, MAX_COLLECTORS)),
         ("order", "i8"),
-        ("queue_load", "i4", (MAX_SCHEDULERS, MAX_MEMORY_QUEUE)),
-        ("eject_head", "i4"),
-        ("eject_count", "i4"),
-        ("free_places", "i4"),
+        # Queues of the load/store unit, place by place: most hold one.
+        ("queue_warp", "i4", (MAX_MEMORY_QUEUE, MAX_SCHEDULERS)),
+        ("queue_time", "i8", (MAX_MEMORY_QUEUE, MAX_SCHEDULERS)),
+        ("queue_row", "i8", (MAX_MEMORY_QUEUE, MAX_SCHEDULERS)),
+        ("queue_load", "i4", (MAX_MEMORY_QUEUE, MAX_SCHEDULERS)),
         ("wheel", "u8", (WHEEL,)),
     ],
     align=True,
@@ -207,6 +247,9 @@ PIPE = np.dtype(
         ("left", "i8"),  # sectors of the instruction still to do
         ("code", "i4"),  # instruction
         ("path", "i4"),
+        ("is_located", "i4"),  # whether the sector at hand has been located
+        ("slice", "i4"),  # its L2 slice, or -1: not known yet
+        ("number", "i8"),  # its line number there
         ("free_at", "i8"),  # when the tag, data and filter laws allow the next instruction
         ("next_writeback", "i4"),
         ("next_global", "i4"),
@@ -219,6 +262,9 @@ PIPE = np.dtype(
         ("bank_failed", "i8", (MAX_BANKS,)),
         ("bank_ready", "i8", (MAX_BANKS,)),  # of the oldest access in it
         ("bank_write", "i4", (MAX_BANKS,)),  # whether the one that failed is a store
+        ("bank_reason", "i4", (MAX_BANKS,)),  # why it failed
+        ("bank_filled", "i8", (MAX_BANKS,)),  # the node's num_filled and num_taken then
+        ("bank_taken", "i8", (MAX_BANKS,)),
         ("in_banks", "i8"),
         ("blocked", "i4"),  # 0, or why nothing left the pipe this cycle
         # The texture FIFOs.
@@ -279,23 +325,29 @@ ROW = np.dtype(
     align=True,
 )
 
-PORT = np.dtype(
+#: A request of a row: its line number at the L1, and the sectors it asks for.
+ASK = np.dtype([("line", "i8"), ("group", "i4"), ("mask", "u1")], align=True)
+
+PORT = np.dtype([("head", "i4"), ("count", "i4"), ("busy", "i8")], align=True)
+OUTLET = np.dtype([("busy", "i8"), ("head", "i4"), ("count", "i4"), ("turn", "i4")], align=True)
+#: A packet at an input, and one at an output. time: the cycle from which it may move on.
+PACKET = np.dtype(
     [
-        ("in_head", "i4"),
-        ("in_count", "i4"),
-        ("in_busy", "i8"),
-        ("candidate", "i4"),  # next input whose head wants the same output
+        ("time", "i8"),
+        ("request", "i4"),
+        ("entered", "u4"),  # when it entered the network, modulo 2^32
+        ("output", "i2"),
+        ("flits", "i2"),
     ],
     align=True,
 )
-OUTLET = np.dtype(
+#: A request that waits for a time: at a network's output, in a level's delay. So many wait that
+#: their records have left the host's cache.
+WAITING = np.dtype(
     [
-        ("head", "i4"),
-        ("count", "i4"),
-        ("busy", "i8"),
-        ("turn", "i4"),
-        ("first", "i4"),  # inputs whose head wants this output
-        ("stamp", "i8"),  # cycle for which `first` holds
+        ("time", "i8"),
+        ("request", "i4"),
+        ("entered", "u4"),  # when, modulo 2^32; in an L1 bank, where its line's chain begins
     ],
     align=True,
 )
@@ -311,6 +363,9 @@ CHANNEL = np.dtype(
         ("priority", "i4"),
         ("pending", "i4"),
         ("num_serving", "i4"),
+        # Ticks before which no column or row command can be issued.
+        ("column_from", "i8"),
+        ("row_from", "i8"),
         ("serving", "u8"),  # mask of banks that have a request
         ("waiting", "u8"),  # mask of banks with requests behind
         ("last_borrower", "i4"),

@@ -6,11 +6,10 @@ reply ◄── ready MSHRs ◄── fill ◄── from below
 
 from __future__ import annotations
 
-from cachesim.compiled import compiled
+from cachesim.compiled import compiled, small
 from cachesim.counts import HIT_BACK
 from cachesim.stream import ATOMIC, LOAD, STORE
 from cachesim.timing.access import (
-    DELAY,
     DOWN,
     FILLS,
     IN,
@@ -37,18 +36,18 @@ from cachesim.timing.records import (
 from cachesim.timing.tags import next_ready
 
 
-@compiled
+@small
 def _push(tags, node, which, head, count, request):  # type: ignore[no-untyped-def]
     room = tags.queues.shape[2] - 1
     tags.queues[node, which, (head + count) & room] = request
 
 
-@compiled
+@small
 def _front(tags, node, which, head):  # type: ignore[no-untyped-def]
     return tags.queues[node, which, head & (tags.queues.shape[2] - 1)]
 
 
-@compiled
+@small
 def _answer(tags, pool, node, request):  # type: ignore[no-untyped-def]
     """Queue a reply towards the SMs."""
     home = tags.nodes[node]
@@ -56,7 +55,7 @@ def _answer(tags, pool, node, request):  # type: ignore[no-untyped-def]
     home.out_count += 1
 
 
-@compiled
+@small
 def _take_ready(tags, pool, node, now):  # type: ignore[no-untyped-def]
     """Answer one request whose data is there."""
     home = tags.nodes[node]
@@ -99,7 +98,7 @@ def _take_fill(tags, pool, node, now):  # type: ignore[no-untyped-def]
     return True
 
 
-@compiled
+@small
 def _drain_miss(tags, node):  # type: ignore[no-untyped-def]
     home = tags.nodes[node]
     if home.miss_count == 0 or home.down_count >= tags.level[0].queue_down:
@@ -165,36 +164,42 @@ def _look_up(tags, pool, node, now):  # type: ignore[no-untyped-def]
     return True
 
 
-@compiled
+@small
 def _leave_delay(tags, pool, node, now):  # type: ignore[no-untyped-def]
     home = tags.nodes[node]
     if home.delay_count == 0 or home.in_count >= tags.level[0].queue_in:
         return False
     if home.delay_ready > now:
         return False
-    request = _front(tags, node, DELAY, home.delay_head)
+    room = tags.delay.shape[1] - 1
+    first = tags.delay[node, home.delay_head & room]
+    request = first.request
+    if tags.level[0].index == L2:
+        # It is looked up in a later cycle; until then the host fetches its record.
+        pool.requests[request].mark = first.entered
     _push(tags, node, IN, home.in_head, home.in_count, request)
     home.in_count += 1
     home.delay_head += 1
     home.delay_count -= 1
     if home.delay_count > 0:
-        following = _front(tags, node, DELAY, home.delay_head)
-        home.delay_ready = pool.requests[following].ready
+        home.delay_ready = tags.delay[node, home.delay_head & room].time
     return True
 
 
-@compiled
-def arrive(tags, pool, node, request, ready):  # type: ignore[no-untyped-def]
+@small
+def arrive(tags, node, request, ready, now):  # type: ignore[no-untyped-def]
     """A request reaches the level; it may be looked up after cycle `ready`."""
     home = tags.nodes[node]
-    pool.requests[request].ready = ready
-    _push(tags, node, DELAY, home.delay_head, home.delay_count, request)
+    place = tags.delay[node, (home.delay_head + home.delay_count) & (tags.delay.shape[1] - 1)]
+    place.time = ready
+    place.request = request
+    place.entered = now
     if home.delay_count == 0:
         home.delay_ready = ready
     home.delay_count += 1
 
 
-@compiled
+@small
 def come_back(tags, pool, node, request):  # type: ignore[no-untyped-def]
     """Data or an acknowledgement reaches the level from below."""
     home = tags.nodes[node]

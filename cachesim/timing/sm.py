@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from cachesim.compiled import compiled
+from cachesim.compiled import compiled, small
 from cachesim.stream import STORE
 from cachesim.timing.bits import bit_at, lowest, without_lowest
 from cachesim.timing.pipe import step_pipe
@@ -34,7 +34,7 @@ _AHEAD = 3
 _PORT_ORDER = (FP32, SFU, MEMORY, INT)
 
 
-@compiled
+@small
 def _pick(state, index, scheduler, candidates):  # type: ignore[no-untyped-def]
     """The warp slot a scheduler chooses among the candidates (a mask)."""
     machine = state.pool.machine[0]
@@ -74,7 +74,7 @@ def _note_access(state, warp, row):  # type: ignore[no-untyped-def]
     return load
 
 
-@compiled
+@small
 def _unit_of(machine, kind):  # type: ignore[no-untyped-def]
     """The unit that executes a kind; GPGPU-Sim's control instructions take the fp32 one."""
     if kind == CONTROL and machine.collector_units > 0:
@@ -94,11 +94,11 @@ def _dispatch(state, index, s, c):  # type: ignore[no-untyped-def]
             return False
         sm.queue_head[s] = 0
         sm.queue_count[s] = 1
-        sm.queue_warp[s, 0] = sm.collector_slot[s, c]
+        sm.queue_warp[0, s] = sm.collector_slot[s, c]
         # The load/store unit takes the oldest of those that are there.
-        sm.queue_time[s, 0] = sm.collector_order[s, c]
-        sm.queue_row[s, 0] = sm.collector_row[s, c]
-        sm.queue_load[s, 0] = sm.collector_load[s, c]
+        sm.queue_time[0, s] = sm.collector_order[s, c]
+        sm.queue_row[0, s] = sm.collector_row[s, c]
+        sm.queue_load[0, s] = sm.collector_load[s, c]
     else:
         unit = _unit_of(machine, kind)
         # One instruction may wait between collector and unit.
@@ -153,6 +153,7 @@ def _allocate(state, index, kind):  # type: ignore[no-untyped-def]
             sm.collector_load[oldest, c] = sm.issued_load[oldest]
         sm.issued_slot[kind, oldest] = -1
         sm.num_issued[kind] -= 1
+        sm.is_stuck = 0
         return True
     return False
 
@@ -165,14 +166,21 @@ def _collect(state, index):  # type: ignore[no-untyped-def]
     """
     machine = state.pool.machine[0]
     sm = state.sms[index]
+    now = machine.now
+    changed = False
+    later = NEVER
     for _ in range(2):
         for s in range(machine.num_schedulers):
             for c in range(machine.collector_units):
-                if sm.collector_slot[s, c] >= 0:
-                    if sm.collector_ready[s, c] > 0:
-                        _dispatch(state, index, s, c)
-                    else:
-                        sm.collector_ready[s, c] += 1
+                if sm.collector_slot[s, c] < 0:
+                    continue
+                if sm.collector_ready[s, c] <= 0:
+                    sm.collector_ready[s, c] += 1
+                    changed = True
+                elif _dispatch(state, index, s, c):
+                    changed = True
+                elif sm.collector_kind[s, c] != MEMORY:
+                    later = now + 1
         # Each of the ports takes the oldest of every kind in turn; one that finds no collector of
         # its scheduler free blocks its kind.
         moved = True
@@ -180,6 +188,8 @@ def _collect(state, index):  # type: ignore[no-untyped-def]
             moved = False
             for place in range(4):
                 moved |= _allocate(state, index, _PORT_ORDER[place])
+            changed |= moved
+    sm.collect_from = now + 1 if changed else later
 
 
 @compiled
@@ -190,6 +200,7 @@ def _enter_collectors(state, index, s, slot, warp, kind):  # type: ignore[no-unt
     place = kind if kind == MEMORY else _unit_of(machine, kind)
     sm.order += 1
     sm.num_collecting += 1
+    sm.collect_from = 0
     sm.issued_slot[place, s] = slot
     sm.num_issued[place] += 1
     sm.issued_order[place, s] = sm.order
@@ -235,14 +246,14 @@ def _start_memory(state, index, scheduler, slot, warp, now):  # type: ignore[no-
     at = sm.queue_head[scheduler] + sm.queue_count[scheduler]
     if at >= machine.memory_queue:
         at -= machine.memory_queue
-    sm.queue_warp[scheduler, at] = slot
-    sm.queue_time[scheduler, at] = now + machine.memory_cycles - 1
-    sm.queue_row[scheduler, at] = warp.row
+    sm.queue_warp[at, scheduler] = slot
+    sm.queue_time[at, scheduler] = now + machine.memory_cycles - 1
+    sm.queue_row[at, scheduler] = warp.row
     sm.queue_count[scheduler] += 1
-    sm.queue_load[scheduler, at] = _note_access(state, warp, row)
+    sm.queue_load[at, scheduler] = _note_access(state, warp, row)
 
 
-@compiled
+@small
 def _has_room(state, index, scheduler, kind, now):  # type: ignore[no-untyped-def]
     """Whether a scheduler may issue an instruction of a kind."""
     machine = state.pool.machine[0]
@@ -374,10 +385,10 @@ def step_sm(state, index):  # type: ignore[no-untyped-def]
         blocked = max(blocked, state.pipes[unit].blocked)
     if sm.num_timed > 0:
         wake_timed(state, index)
-    if sm.num_collecting > 0:
+    if sm.num_collecting > 0 and sm.collect_from <= now:
         _collect(state, index)
     issued = 0
-    if sm.num_resident > 0:
+    if sm.num_resident > 0 and not sm.is_stuck:
         ready = sm.ready[0] | sm.ready[1] | sm.ready[2] | sm.ready[3] | sm.ready[4]
         scheduler = now % machine.num_schedulers
         for _ in range(machine.num_schedulers):
@@ -386,6 +397,9 @@ def step_sm(state, index):  # type: ignore[no-untyped-def]
             scheduler += 1
             if scheduler == machine.num_schedulers:
                 scheduler = 0
+        # Without collectors, room for arithmetic comes with time.
+        arithmetic = sm.ready[0] | sm.ready[1] | sm.ready[2] | sm.ready[3]
+        sm.is_stuck = issued == 0 and (machine.collector_units > 0 or arithmetic == 0)
     if issued > 0:
         machine.progress = now
         reason = R_ISSUE

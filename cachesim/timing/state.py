@@ -27,9 +27,9 @@ class Pool(NamedTuple):
 class Work(NamedTuple):
     """What the SMs run: rings of rows and of their requests, filled by `feed`.
 
-    instructions, operations: the static program. rows: ring of `records.ROW`. line: ring of int64
-    line numbers at the L1; mask: uint8 sectors; group: int32; written: int64 place in `granules`,
-    ring of uint32, one per sector of a stored line.
+    instructions, operations: the static program. rows: ring of `records.ROW`; asks: ring of
+    `records.ASK`; written: with it, int64 place in `granules`, ring of uint32, one per sector of a
+    stored line.
     warp_first, warp_rows: int64 per warp of the queued CTAs, -1 rows = padding; cta_left: uint8
     per queued CTA.
     """
@@ -37,9 +37,7 @@ class Work(NamedTuple):
     instructions: npt.NDArray[np.void]
     operations: npt.NDArray[np.void]
     rows: npt.NDArray[np.void]
-    line: npt.NDArray[np.int64]
-    mask: npt.NDArray[np.uint8]
-    group: npt.NDArray[np.int32]
+    asks: npt.NDArray[np.void]
     written: npt.NDArray[np.int64]
     granules: npt.NDArray[np.uint32]
     warp_first: npt.NDArray[np.int64]
@@ -83,7 +81,8 @@ class State(NamedTuple):
     """The machine.
 
     latencies: (4, 2) int64 of the execution units, latency and initiation by kind.
-    banks: (units * banks, room) int32 the L1's delay lines. responses: (units, room) int32.
+    banks: (units * banks, room) `records.WAITING`, the L1's delay lines. port_of: (units,) int32,
+    the interconnect's port of an L1 unit. responses: (units, room) int32.
     ejection: (SMs, room) int32; cta_at: (SMs, places) int64; warps_left: the same.
     fifo: (units, 3, room) int32, the texture L1's reorder buffer, requests and results.
     scheduler_masks: (schedulers,) uint64. reasons: (reasons,) int64 SM-cycles.
@@ -106,7 +105,8 @@ class State(NamedTuple):
     l2_route: Route
     llc_route: Route
     memory: Memory
-    banks: npt.NDArray[np.int32]
+    banks: npt.NDArray[np.void]
+    port_of: npt.NDArray[np.int32]
     responses: npt.NDArray[np.int32]
     ejection: npt.NDArray[np.int32]
     cta_at: npt.NDArray[np.int64]
@@ -136,9 +136,7 @@ define(
         "instructions": (records.INSTRUCTION, 1),
         "operations": (records.OPERATION, 1),
         "rows": (records.ROW, 1),
-        "line": (_I64, 1),
-        "mask": (_U8, 1),
-        "group": (_I32, 1),
+        "asks": (records.ASK, 1),
         "written": (_I64, 1),
         "granules": (_U32, 1),
         "warp_first": (_I64, 1),
@@ -178,19 +176,20 @@ define(
         "counters": (_I64, 2),
         "outcomes": (_I64, 2),
         "queues": (_I32, 3),
+        "delay": (records.WAITING, 2),
     },
 )
 define(
     "Network",
     {
         "inputs": (records.PORT, 1),
-        "in_ring": (_I32, 2),
-        "in_time": (_I64, 2),
-        "in_out": (_I32, 2),
-        "in_flits": (_I32, 2),
+        "in_ring": (records.PACKET, 2),
         "outputs": (records.OUTLET, 1),
-        "out_ring": (_I32, 2),
-        "out_time": (_I64, 2),
+        "out_ring": (records.WAITING, 2),
+        "arrivals": (_I64, 1),
+        "unready": (np.uint64, 1),
+        "wanted": (np.uint64, 2),
+        "contested": (np.uint64, 1),
         "scalars": (_I64, 1),
     },
 )
@@ -212,7 +211,8 @@ define(
         "l2_route": "Route",
         "llc_route": "Route",
         "memory": "Memory",
-        "banks": (_I32, 2),
+        "banks": (records.WAITING, 2),
+        "port_of": (_I32, 1),
         "responses": (_I32, 2),
         "ejection": (_I32, 2),
         "cta_at": (_I64, 2),

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cachesim.address import index_of
-from cachesim.compiled import compiled
+from cachesim.compiled import compiled, small
 from cachesim.timing.records import NEVER
 
 
@@ -24,7 +24,8 @@ class Tags(NamedTuple):
     sets: (S,); buckets, mshr_buckets: int32 heads of hash chains, -1 = empty; mshrs: (M,).
     set_table: the tables of the set hash. counters: (groups, counters) int64 as in
     `cachesim.counts`. outcomes: (2, 6) int64, reads and writes by `records.OUTCOMES`.
-    queues: (instances, 6, room) int32, rings of requests by `IN` to `OUT`.
+    queues: (instances, 5, room) int32, rings of requests by `IN` to `OUT`. delay: (instances, room)
+    `records.WAITING`, ring of requests on their way to the look-up.
     """
 
     level: npt.NDArray[np.void]
@@ -40,19 +41,27 @@ class Tags(NamedTuple):
     counters: npt.NDArray[np.int64]
     outcomes: npt.NDArray[np.int64]
     queues: npt.NDArray[np.int32]
+    delay: npt.NDArray[np.void]
 
 
-@compiled
+@small
 def spread(key):  # type: ignore[no-untyped-def]
-    """A hash of a line or sector number for the chains."""
-    return ((key * 0x1E3779B97F4A7C15) >> 29) ^ (key >> 7)
+    """A hash of a line or sector number for the chains; eight neighbours share a host line."""
+    run = key >> 3
+    return ((((run * 0x1E3779B97F4A7C15) >> 29) ^ (run >> 7)) << 3) | (key & 7)
 
 
-@compiled
+@small
+def bucket_of(tags, node, key):  # type: ignore[no-untyped-def]
+    """Where the chain begins that may hold `key`."""
+    mask = tags.level[0].bucket_mask
+    return node * (mask + 1) + (spread(key) & mask)
+
+
+@small
 def find_line(tags, node, key):  # type: ignore[no-untyped-def]
     """The line of an instance that holds `key`, or -1."""
-    mask = tags.level[0].bucket_mask
-    at = tags.buckets[node * (mask + 1) + (spread(key) & mask)]
+    at = tags.buckets[bucket_of(tags, node, key)]
     lines = tags.lines
     while at >= 0 and lines[at].key != key:
         at = lines[at].chain
@@ -67,7 +76,7 @@ def set_of(tags, node, number):  # type: ignore[no-untyped-def]
     return node * level.num_sets + np.int64(index)
 
 
-@compiled
+@small
 def touch(tags, line):  # type: ignore[no-untyped-def]
     """Make a line its set's newest."""
     lines = tags.lines
@@ -75,15 +84,16 @@ def touch(tags, line):  # type: ignore[no-untyped-def]
     home = tags.sets[one.set]
     if home.newest == line:
         return
+    base = one.set * tags.level[0].ways
     newer, older = one.newer, one.older
-    lines[newer].older = older
+    lines[base + newer].older = older
     if older >= 0:
-        lines[older].newer = newer
+        lines[base + older].newer = newer
     else:
-        home.oldest = newer
-    one.older = home.newest
+        home.oldest = base + newer
+    one.older = home.newest - base
     one.newer = -1
-    lines[home.newest].newer = line
+    lines[home.newest].newer = line - base
     home.newest = line
 
 
@@ -99,23 +109,22 @@ def victim_of(tags, node, home):  # type: ignore[no-untyped-def]
     dirty = tags.nodes[node].dirty_lines
     spare_dirty = dirty * 100 < level.dirty_limit * level.num_sets * level.ways
     at = tags.sets[home].oldest
-    while at >= 0:
+    while True:
         one = lines[at]
         if one.reserved == 0 and not (spare_dirty and one.modified != 0):
             return at
-        at = one.newer
-    return -1
+        if one.newer < 0:
+            return -1
+        at = home * level.ways + one.newer
 
 
 @compiled
 def install(tags, node, line, key):  # type: ignore[no-untyped-def]
     """Give a line another tag, its sectors empty, and make it the newest."""
-    mask = tags.level[0].bucket_mask
     lines, buckets = tags.lines, tags.buckets
     one = lines[line]
-    base = node * (mask + 1)
     if one.key != -NEVER:
-        bucket = base + (spread(one.key) & mask)
+        bucket = bucket_of(tags, node, one.key)
         if buckets[bucket] == line:
             buckets[bucket] = one.chain
         else:
@@ -125,7 +134,7 @@ def install(tags, node, line, key):  # type: ignore[no-untyped-def]
             lines[before].chain = one.chain
     if one.modified != 0:
         tags.nodes[node].dirty_lines -= 1
-    bucket = base + (spread(key) & mask)
+    bucket = bucket_of(tags, node, key)
     one.key = key
     one.chain = buckets[bucket]
     buckets[bucket] = line
@@ -136,7 +145,7 @@ def install(tags, node, line, key):  # type: ignore[no-untyped-def]
     touch(tags, line)
 
 
-@compiled
+@small
 def reserve(tags, line, bit):  # type: ignore[no-untyped-def]
     """Note that a sector of a line is on its way."""
     one = tags.lines[line]
@@ -145,7 +154,7 @@ def reserve(tags, line, bit):  # type: ignore[no-untyped-def]
     one.reserved |= bit
 
 
-@compiled
+@small
 def find_mshr(tags, node, key):  # type: ignore[no-untyped-def]
     """The MSHR of an instance for sector `key`, or -1."""
     mask = tags.level[0].mshr_mask
@@ -166,6 +175,7 @@ def take_mshr(tags, requests, node, key, request):  # type: ignore[no-untyped-de
     entry = tags.mshrs[at]
     home.mshr_free = entry.ready_next
     home.mshr_used += 1
+    home.num_taken += 1
     bucket = node * (mask + 1) + (spread(key) & mask)
     entry.key = key
     entry.chain = tags.mshr_buckets[bucket]
@@ -177,7 +187,7 @@ def take_mshr(tags, requests, node, key, request):  # type: ignore[no-untyped-de
     requests[request].next[level.index] = -1
 
 
-@compiled
+@small
 def merge(tags, requests, entry, request):  # type: ignore[no-untyped-def]
     """Append a request to those that wait for a sector."""
     index = tags.level[0].index

@@ -9,13 +9,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from cachesim.compiled import compiled
+from cachesim.compiled import compiled, small
 from cachesim.stream import STORE
 from cachesim.timing.bits import bit_at, lowest, without_lowest
 from cachesim.timing.records import MAX_LOADS, MAX_WARPS, MEMORY, NEVER, WAIT, WHEEL
 
 
-@compiled
+@small
 def _block(sm, warp, until):  # type: ignore[no-untyped-def]
     warp.waits_for = until
     sm.num_blocked += 1
@@ -41,13 +41,13 @@ def _finish(state, index, slot):  # type: ignore[no-untyped-def]
         machine.ctas_done += 1
 
 
-@compiled
+@small
 def is_exit(warp):  # type: ignore[no-untyped-def]
     """Whether the warp's next instruction is its exit, which depends on nothing."""
     return warp.in_trailer and warp.operation == warp.last_operation - 1
 
 
-@compiled
+@small
 def has_exited(warp):  # type: ignore[no-untyped-def]
     """Whether the warp has issued all its instructions."""
     return warp.in_trailer and warp.operation >= warp.last_operation
@@ -117,6 +117,7 @@ def schedule(state, index, slot, earliest):  # type: ignore[no-untyped-def]
     bit = bit_at(slot)
     if ready <= machine.now:
         sm.ready[kind] |= bit
+        sm.is_stuck = 0
     else:
         sm.wheel[ready & (WHEEL - 1)] |= bit
         sm.num_timed += 1
@@ -143,6 +144,7 @@ def wake_timed(state, index):  # type: ignore[no-untyped-def]
             schedule(state, index, slot, machine.now)
         else:
             sm.ready[kind] |= bit_at(slot)
+            sm.is_stuck = 0
 
 
 @compiled
