@@ -12,13 +12,59 @@ if TYPE_CHECKING:
     from kernels.method import Method
 
 Kind = Annotated[
-    str, typer.Option("--method", metavar="fixed|adaptive", help="How many samples a pixel takes.")
+    str,
+    typer.Option(
+        "--method",
+        metavar="fixed|adaptive|separable|hybrid",
+        help="How many samples a pixel takes; or a filter instead; or either by 8x8 tile.",
+    ),
 ]
 Samples = Annotated[int, typer.Option("--samples", metavar="N", help="Samples of the fixed count.")]
 SamplesMin = Annotated[int, typer.Option("--b-min", metavar="N", help="Least adaptive count.")]
 SamplesMax = Annotated[int, typer.Option("--b-max", metavar="N", help="Largest adaptive count.")]
 Rule = Annotated[
-    str, typer.Option("--rule", metavar="paper|engine", help="Rule of the adaptive count.")
+    str,
+    typer.Option("--rule", metavar="paper|o1|sliding|engine", help="Rule of the adaptive count."),
+]
+Estimator = Annotated[
+    str,
+    typer.Option(
+        "--estimator",
+        metavar="history|two-pass|last-frame",
+        help="Where the adaptive count comes from.",
+    ),
+]
+Pilots = Annotated[
+    int, typer.Option("--pilots", metavar="N", help="Discarded samples of the two-pass estimator.")
+]
+Control = Annotated[
+    str,
+    typer.Option(
+        "--control",
+        metavar="none|constant|online",
+        help="Control variate of the tracked luminance; it changes counts, never colours.",
+    ),
+]
+EtaCov = Annotated[
+    float, typer.Option("--eta-cov", help="Weight of the newest frame in the covariance, 0 to 1.")
+]
+EpsilonA = Annotated[
+    float, typer.Option("--epsilon-a", help="Pulls the online coefficient to 1 where all is still.")
+]
+Disocclusion = Annotated[
+    str,
+    typer.Option(
+        "--disocclusion",
+        metavar="variance|offscreen|none",
+        help="Which pixels have no history: off the screen or off in depth, the first, or none.",
+    ),
+]
+EpsilonU = Annotated[
+    float | None,
+    typer.Option(
+        "--epsilon-u",
+        help="Separate distant light; pixels whose share of it is at most this stay diffuse.",
+    ),
 ]
 Kappa = Annotated[float, typer.Option("--kappa", help="Damping of the paper's rule, 0 to 1.")]
 Alpha = Annotated[float, typer.Option("--alpha", help="Weight of the newest frame, 0 to 1.")]
@@ -51,6 +97,34 @@ Bilateral = Annotated[
 NormalWeights = Annotated[
     bool, typer.Option("--normal-weights/--no-normal-weights", help="Weigh samples by normals.")
 ]
+Taps = Annotated[
+    int, typer.Option("--taps", metavar="N", help="Taps of a pass of the separable filter, odd.")
+]
+SeparableProfile = Annotated[
+    str,
+    typer.Option("--separable-profile", metavar="burley|skin", help="Weights of the taps."),
+]
+HybridCount = Annotated[
+    str,
+    typer.Option(
+        "--hybrid-count", metavar="adaptive|fixed", help="Samples of the tiles that are sampled."
+    ),
+]
+HybridRules = Annotated[
+    str,
+    typer.Option(
+        "--hybrid-rules",
+        metavar="LIST",
+        help="Which tiles are sampled: those above the count, above the radius, or painted.",
+    ),
+]
+CountThreshold = Annotated[
+    float, typer.Option("--count-threshold", help="Mean count above which a tile is sampled.")
+]
+RadiusThreshold = Annotated[
+    float,
+    typer.Option("--radius-threshold", help="Mean radius, pixels, above which a tile is sampled."),
+]
 Planes = Annotated[
     str, typer.Option("--planes", metavar="LIST", help="Planes of the sampling pass to record.")
 ]
@@ -64,18 +138,21 @@ LaneMap = Annotated[
 ]
 
 ALL_PLANES = "colour,normal,profile_id"
-ALL_PASSES = "setup,prefilter,sampling,update,combine"
+ALL_PASSES = (
+    "setup,prefilter,classify,pilot,sampling,separable_h,separable_v,update,combine,overlay,taa"
+)
 
 
 def make_method(fields: dict[str, Any]) -> Method:
-    """A `Method` of a command's arguments; `planes` and `passes` may be comma-separated text.
+    """A `Method` of a command's arguments; tuples of names come as comma-separated text.
 
     Raises:
         InputError: a field has a value that is not allowed.
     """
     from kernels.method import Method
 
-    for name in ("planes", "passes"):
+    for name in ("planes", "passes", "hybrid_rules"):
         if name in fields:
-            fields = {**fields, name: tuple(parse_names(fields[name], f"--{name}"))}
+            option = "--" + name.replace("_", "-")
+            fields = {**fields, name: tuple(parse_names(fields[name], option))}
     return Method(**fields)

@@ -30,6 +30,13 @@ def command(
     device: DeviceName = None,
     method: options.Kind = "adaptive",
     samples: options.Samples = 64,
+    estimator: options.Estimator = "history",
+    pilots: options.Pilots = 8,
+    control: options.Control = "none",
+    eta_cov: options.EtaCov = 0.05,
+    epsilon_a: options.EpsilonA = 1e-4,
+    disocclusion: options.Disocclusion = "variance",
+    epsilon_u: options.EpsilonU = None,
     rule: options.Rule = "paper",
     kappa: options.Kappa = 0.2,
     sigma0_sq: options.Sigma0Sq = 0.001,
@@ -37,6 +44,12 @@ def command(
     mip_rule: options.MipRule = "eq-5.12",
     inverse_cdf: options.InverseCdf = "approximate",
     weights: options.Weights = "self-normalised",
+    taps: options.Taps = 27,
+    separable_profile: options.SeparableProfile = "burley",
+    hybrid_count: options.HybridCount = "adaptive",
+    hybrid_rules: options.HybridRules = "count,radius",
+    count_threshold: options.CountThreshold = 16.0,
+    radius_threshold: options.RadiusThreshold = 64.0,
 ) -> None:
     """Render a scene: without scattering, with it, and the map of sample counts."""
     from experiments.console import progress, remark
@@ -49,6 +62,13 @@ def command(
         {
             "kind": method,
             "num_samples": samples,
+            "estimator": estimator,
+            "num_pilots": pilots,
+            "control": control,
+            "eta_cov": eta_cov,
+            "epsilon_a": epsilon_a,
+            "disocclusion": disocclusion,
+            "epsilon_u": epsilon_u,
             "rule": rule,
             "kappa": kappa,
             "sigma0_sq": sigma0_sq,
@@ -56,6 +76,12 @@ def command(
             "mip_rule": mip_rule,
             "inverse_cdf": inverse_cdf,
             "weights": weights,
+            "num_taps": taps,
+            "separable_profile": separable_profile,
+            "hybrid_count": hybrid_count,
+            "hybrid_rules": hybrid_rules,
+            "count_threshold": count_threshold,
+            "radius_threshold_px": radius_threshold,
         }
     )
     folder = output_folder(output)

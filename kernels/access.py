@@ -12,12 +12,18 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from kernels.grid import OUTSIDE
+from kernels.grid import OUTSIDE, WARPS_PER_CTA
 from traces.texture import INACTIVE_TEXEL, WARP_SIZE
 from traces.trace import Instruction
 
 States = npt.NDArray[np.int32]
 Offsets = npt.NDArray[np.int64]
+
+
+def scattering_tiles(states: States) -> npt.NDArray[np.bool_]:
+    """(num_warps,) bool: whether a lane of the warp's CTA scatters. states: of whole CTAs."""
+    any_of_tile = (states.reshape(-1, WARPS_PER_CTA) > 0).any(axis=1)
+    return np.repeat(any_of_tile, WARPS_PER_CTA)
 
 
 @dataclass(frozen=True)
@@ -27,6 +33,9 @@ class Access:
     texture: name. subsurface_only: executed by warps with a scattering lane, for those lanes; else
         by every lane in the frame.
     in_loop: executed once per sample; implies subsurface_only.
+    of_tile: executed by all lanes of both warps of a CTA in which any lane scatters; goes with
+        subsurface_only, and stands before the accesses that do not.
+    argument: the kernel's name of the buffer, where it reads a texture a second time.
     arithmetic: as in `Instruction`. first: the same in the loop's first turn. scattering: the same
         in warps with a scattering lane, where others execute the access too. None: no different.
     """
@@ -36,6 +45,8 @@ class Access:
     footprint: str = "point"
     subsurface_only: bool = False
     in_loop: bool = False
+    of_tile: bool = False
+    argument: str = ""
     arithmetic: tuple[tuple[str, int], ...] = ()
     first: tuple[tuple[str, int], ...] | None = None
     scattering: tuple[tuple[str, int], ...] | None = None
@@ -89,10 +100,13 @@ class Program:
     def row_offsets(self, states: States) -> Offsets:
         """(num_warps + 1,) int64: where each warp's rows begin."""
         in_loop = len(self._loop)
-        subsurface = sum(a.subsurface_only for a in self.accesses)
-        always = len(self.accesses) - subsurface - in_loop
+        of_tile = sum(a.of_tile for a in self.accesses)
+        subsurface = sum(a.subsurface_only for a in self.accesses) - of_tile
+        always = len(self.accesses) - subsurface - of_tile - in_loop
         rows = np.where(states > 0, always + subsurface + in_loop * states.astype(np.int64), always)
         rows[states == OUTSIDE] = 0
+        if of_tile:
+            rows += of_tile * scattering_tiles(states)
         return np.concatenate([[0], np.cumsum(rows)])
 
     def _rows_outside_loop(
@@ -108,6 +122,8 @@ class Program:
                     before += len(loop) * np.maximum(states, 0)
                 continue
             executes = states > 0 if access.subsurface_only else states != OUTSIDE
+            if access.of_tile:
+                executes = scattering_tiles(states)
             warps = np.flatnonzero(executes)
             found.append((i, warps, offsets[:-1][warps] + before[warps]))
             before += executes

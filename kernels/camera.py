@@ -28,6 +28,7 @@ class Camera:
     follows the aspect.
     coverage_rate: share of the frame that is skin at 1920x1080, None if not stated.
     pixels_per_mm: median physical scale over the skin at 1920x1080, None if not stated.
+    jitter: where in its pixel each ray goes through, pixels to the right and down of the centre.
     """
 
     name: str
@@ -37,6 +38,7 @@ class Camera:
     projection_x: float = PORTRAIT
     coverage_rate: float | None = None
     pixels_per_mm: float | None = None
+    jitter: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.projection_x) and self.projection_x > 0):
@@ -45,6 +47,10 @@ class Camera:
             )
         if not np.isfinite([*self.position, *self.target, *self.up]).all():
             raise InputError(f"camera {self.name}: position, target and up must be finite numbers")
+        if not all(abs(offset) <= 2 for offset in self.jitter):
+            raise InputError(
+                f"camera {self.name}: jitter {self.jitter}: allowed are -2 to 2 pixels"
+            )
         forward = np.subtract(self.target, self.position)
         if not np.cross(forward, self.up).any():
             raise InputError(
@@ -59,6 +65,19 @@ class Camera:
         forward = _unit(np.subtract(self.target, self.position, dtype=np.float64))
         right = _unit(np.cross(forward, np.asarray(self.up, dtype=np.float64)))
         return right, np.cross(right, forward), forward
+
+    def centre_ray(self, width: int) -> npt.NDArray[np.float64]:
+        """(3,): the ray through the middle of a frame, 1 long along the view axis: forward, moved
+        by the jitter.
+        """
+        right, up, forward = self.basis()
+        if self.jitter == (0.0, 0.0):
+            return forward
+        pixel = 2.0 / (width * self.projection_x)
+        ray: npt.NDArray[np.float64] = (
+            forward + right * (self.jitter[0] * pixel) - up * (self.jitter[1] * pixel)
+        )
+        return ray
 
 
 # The views of the procedural head, named as in the dissertation. The published times suggest a

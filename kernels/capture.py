@@ -2,12 +2,12 @@
 
 `.npz` (no pickles): one array per field of GBuffer, under its name. irradiance, albedo,
 non_subsurface and normal (h, w, 3), depth_cm (h, w): any float type; profile_id (h, w): any integer
-type, 0 to 255; projection_x: a number. non_subsurface (black), attribution and name (texts) may be
-left out.
+type, 0 to 255; projection_x: a number. non_subsurface (black), importance (none), attribution and
+name (texts) may be left out.
 
 OpenEXR: the channels of CHANNELS, half or float, profile.ID half, float or uint. nonsss.* may be
-left out. projection_x is the header's float attribute `projectionX`, attribution its text attribute
-`attribution`.
+left out, and so may importance.Y. projection_x is the header's float attribute `projectionX`,
+attribution its text attribute `attribution`.
 """
 
 from __future__ import annotations
@@ -35,6 +35,8 @@ CHANNELS: dict[str, tuple[str, ...]] = {
     "profile_id": ("profile.ID",),
 }
 OPTIONAL = ("non_subsurface",)
+#: The channel of the field that is None where it is left out.
+IMPORTANCE = "importance.Y"
 
 
 def load_npz(path: str | Path, projection_x: float | None = None) -> GBuffer:
@@ -71,6 +73,8 @@ def save_npz(path: str | Path, gbuffer: GBuffer) -> None:
         "name": np.array(gbuffer.name),
         "attribution": np.array(gbuffer.attribution),
     }
+    if gbuffer.importance is not None:
+        arrays["importance"] = gbuffer.importance
     with replacing(path) as part, writing(path), part.open("wb") as file:
         np.savez_compressed(file, **arrays, **texts, projection_x=np.float64(gbuffer.projection_x))
 
@@ -104,6 +108,8 @@ def load_exr(path: str | Path, projection_x: float | None = None) -> GBuffer:
             raise InputError(f"{path}: channels {', '.join(names)} have different sizes")
         if planes:
             fields[field] = np.stack(planes, axis=-1) if len(names) > 1 else planes[0]
+    if IMPORTANCE in pixels:
+        fields["importance"] = pixels[IMPORTANCE]
     ids = fields["profile_id"]
     if ids.dtype.kind == "f":
         if not (np.isfinite(ids).all() and (ids == np.rint(ids)).all() and np.abs(ids).max() < 1e9):
@@ -135,6 +141,8 @@ def save_exr(path: str | Path, gbuffer: GBuffer) -> None:
         for index, name in enumerate(names):
             dtype = np.uint32 if field == "profile_id" else np.float32
             channels[name] = np.ascontiguousarray(planes[:, :, index], dtype=dtype)
+    if gbuffer.importance is not None:
+        channels[IMPORTANCE] = np.ascontiguousarray(gbuffer.importance)
     with replacing(path) as part, writing(path):
         try:
             OpenEXR.File(header, channels).write(str(part))
@@ -170,8 +178,8 @@ def _gbuffer(
     ):
         raise InputError(f"{path}: profile_id: {ids.dtype}: need whole numbers from 0 to 255")
     planes: dict[str, Any] = {"profile_id": ids.astype(np.uint8)}
-    for field in CHANNELS:
-        if field == "profile_id":
+    for field in (*CHANNELS, "importance"):
+        if field == "profile_id" or (field == "importance" and field not in fields):
             continue
         value = fields.get(field, np.zeros((*shape, 3), np.float32))
         if value.dtype.kind not in "fiu":

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 def result_name(method: Method) -> str:
     """The texture that holds the scattered light: the update pass writes a second one."""
-    return "resolved" if method.adaptive else "scattered"
+    return "resolved" if method.updates_history else "scattered"
 
 
 def accesses(method: Method, frame: int) -> tuple[Access, ...]:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from kernels import update
+from kernels import taa, update
 from kernels.device import Device, open_device
 from kernels.gbuffer import GBuffer
 from kernels.method import Method
@@ -31,8 +31,9 @@ class Frame:
     albedo. combined: (h, w, 3) float32, the finished picture. accumulated: (h, w, 3) float32,
     `combined` blended over the frames with the history's weight alpha, as a temporal anti-aliasing
     pass would show it. counts: (h, w) uint16 samples of each pixel, 0 where nothing scatters.
-    history: (h, w, 4) float32 mean count, depth in cm, variance of the mean and mean; None for the
-        fixed method.
+    history: (h, w, 4) float32 mean count, depth in cm, variance of the mean and mean; None where
+        counts do not come from it.
+    shown: (h, w, 3) float32, the picture of the TAA pass; None without it.
     """
 
     index: int
@@ -41,6 +42,7 @@ class Frame:
     accumulated: Float
     counts: npt.NDArray[np.uint16]
     history: Float | None
+    shown: Float | None = None
 
     @property
     def num_samples(self) -> int:
@@ -57,8 +59,9 @@ def advance(pipeline: Pipeline, scene: Scene, frame: int) -> None:
     come out the same.
     """
     changed = pipeline.load(gbuffer_of(scene, frame))
-    for step in pipeline.steps:
-        if changed or step.pass_name not in ("setup", "prefilter"):
+    for whole_step in pipeline.steps:
+        if changed or whole_step.pass_name not in ("setup", "prefilter"):
+            step = pipeline.listed(whole_step)
             pipeline.run(step, frame, pipeline.states_of(step, frame))
 
 
@@ -108,11 +111,13 @@ def render(
             progress((frame + 1) / num_frames)
     assert accumulated is not None
     scattered = pipeline.read("scattered")
+    has_history = method.updates_history or method.guided_by_last_frame
     return Frame(
         index=frame,
         scattered=scattered[..., :3],
         combined=combined,
         accumulated=accumulated,
         counts=scattered[..., 3].astype(np.uint16),
-        history=pipeline.read(update.history_names(frame)[1]) if method.adaptive else None,
+        history=pipeline.read(update.history_names(frame)[1]) if has_history else None,
+        shown=pipeline.read(taa.texture_names(frame)[1])[..., :3] if method.taa else None,
     )

@@ -31,6 +31,11 @@ class GBuffer:
         (facts sheet 2.5).
     velocity: (h, w, 2) float32, texels: where the surface of a pixel stood in the previous frame,
         minus where it stands now; None = nothing moves.
+    overlay: (h, w, 4) float32, linear RGB and opacity in [0, 1] of something transparent before all
+        the rest, which no plane above knows of; None = nothing.
+    importance: (h, w) float32 in [0, 1], painted: where the hybrid method should sample; None = no
+        such picture.
+    jitter: pixels to the right and down of each pixel's centre, where the camera's rays go through.
     """
 
     name: str
@@ -43,6 +48,9 @@ class GBuffer:
     projection_x: float
     attribution: str = ""
     velocity: Float | None = None
+    overlay: Float | None = None
+    importance: Float | None = None
+    jitter: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self) -> None:
         height, width = self.depth_cm.shape if self.depth_cm.ndim == 2 else (0, 0)
@@ -56,10 +64,20 @@ class GBuffer:
         self._check("profile_id", (height, width), np.uint8)
         if self.velocity is not None:
             self._check("velocity", (height, width, 2), np.float32)
+        if self.overlay is not None:
+            self._check("overlay", (height, width, 4), np.float32)
+            if not (0 <= self.overlay[..., 3].min() and self.overlay[..., 3].max() <= 1):
+                raise InputError(f"{self.name}: overlay: opacity: allowed are 0 to 1")
         if (self.depth_cm < 0).any():
             raise InputError(
                 f"{self.name}: depth_cm: negative values; allowed are 0 (nothing) and up"
             )
+        if self.importance is not None:
+            self._check("importance", (height, width), np.float32)
+            if not (0 <= self.importance.min() and self.importance.max() <= 1):
+                raise InputError(f"{self.name}: importance: allowed are 0 to 1")
+        if not max(map(abs, self.jitter)) <= 2:
+            raise InputError(f"{self.name}: jitter {self.jitter}: allowed are -2 to 2 pixels")
         if not self.projection_x > 0:
             raise InputError(f"{self.name}: projection_x {self.projection_x}: must be positive")
         if not ((self.profile_id > 0) & (self.depth_cm > 0)).any():

@@ -118,7 +118,13 @@ def render_head(
         cl.enqueue_copy(device.queue, profile[first_row : first_row + rows], profile_buffer)
         if progress is not None:
             progress((first_row + rows) / height)
-    return GBuffer(name=camera.name, profile_id=profile, projection_x=camera.projection_x, **planes)
+    return GBuffer(
+        name=camera.name,
+        profile_id=profile,
+        projection_x=camera.projection_x,
+        jitter=camera.jitter,
+        **planes,
+    )
 
 
 @cache
@@ -136,16 +142,16 @@ def _kernels(device: Device) -> tuple[cl.Kernel, cl.Kernel, cl.Buffer]:
 
 
 def _view(camera: Camera, width: int) -> list[npt.NDArray[Any]]:
-    """Origin, right, up, forward as float4; .w of right and up is the size of a pixel at unit
-    depth.
+    """Origin, right, up, the middle ray as float4; .w of right and up is the size of a pixel at
+    unit depth.
     """
-    right, up, forward = camera.basis()
+    right, up, _ = camera.basis()
     pixel = 2.0 / (width * camera.projection_x)
     return [
         _float4(camera.position),
         _float4((*right, pixel)),
         _float4((*up, pixel)),
-        _float4(forward),
+        _float4(camera.centre_ray(width)),
     ]
 
 

@@ -103,6 +103,7 @@ def render_mesh(
         profile_id=(depth > 0).astype(np.uint8),
         projection_x=camera.projection_x,
         attribution=mesh.attribution,
+        jitter=camera.jitter,
         **planes,
     )
 
@@ -132,7 +133,8 @@ def _primary_rays(camera: Camera, width: int, height: int, rows: slice) -> Rays:
     """Origins and directions, row by row. A direction is 1 long along the view axis, so that the
     ray parameter is the linear depth.
     """
-    right, up, forward = camera.basis()
+    right, up, _ = camera.basis()
+    forward = camera.centre_ray(width)
     pixel = 2.0 / (width * camera.projection_x)
     x = (np.arange(width) + 0.5 - width / 2) * pixel
     y = (height / 2 - np.arange(rows.start, rows.stop) - 0.5) * pixel

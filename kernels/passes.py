@@ -5,12 +5,26 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Protocol
 
-from kernels import combine, prefilter, sampling, setup, update
+from kernels import (
+    classify,
+    combine,
+    overlay,
+    pilot,
+    prefilter,
+    sampling,
+    separable,
+    setup,
+    taa,
+    update,
+)
 from kernels.access import Access, Program
 from kernels.grid import Grid
 from kernels.instruction_counts.assign import count_pass
 from kernels.instruction_counts.data import DEFAULT_TARGET
+from kernels.instruction_counts.segments import join
 from kernels.method import PLANES, Method
+from kernels.tiles import CLASS_OF_PASS
+from traces.trace import WAIT
 
 if TYPE_CHECKING:
     from kernels.pipeline import Pipeline
@@ -30,9 +44,15 @@ class Pass(Protocol):
 PASSES: dict[str, Pass] = {
     "setup": setup,
     "prefilter": prefilter,
+    "classify": classify,
+    "pilot": pilot,
     "sampling": sampling,
+    "separable_h": separable.HORIZONTAL,
+    "separable_v": separable.VERTICAL,
     "update": update,
     "combine": combine,
+    "overlay": overlay,
+    "taa": taa,
 }
 
 
@@ -68,14 +88,29 @@ class Step:
             is_recorded.append(access == following)
             following = next(recorded) if access == following else following
         counted = count_pass(self.pass_name, method, accesses, tuple(is_recorded), target)
+        counted_accesses = counted.accesses
+        if method.hybrid and self.pass_name in CLASS_OF_PASS:
+            counted_accesses = _behind_list(counted_accesses)
         return Program(
             self.pass_name,
-            counted.accesses,
+            counted_accesses,
             first_instruction,
             counted.trailing,
             counted.registers_per_thread,
             counted.shared_bytes,
         )
+
+
+def _behind_list(accesses: tuple[Access, ...]) -> tuple[Access, ...]:
+    """The accesses of a pass that reads its tile from a list first, and waits for that."""
+    wait = ((WAIT, 0),)
+    first, *rest = accesses
+    first = replace(
+        first,
+        arithmetic=join(wait, first.arithmetic),
+        scattering=None if first.scattering is None else join(wait, first.scattering),
+    )
+    return (Access("tile_list"), first, *rest)
 
 
 def list_steps(method: Method, grid: Grid, num_levels: int) -> list[Step]:
@@ -85,7 +120,19 @@ def list_steps(method: Method, grid: Grid, num_levels: int) -> list[Step]:
         width, height = grid.width >> level + 1, grid.height >> level + 1
         coarser = Grid(width, height, grid.tile_order, grid.lane_map)
         steps.append(Step("prefilter", level, coarser))
-    steps.append(Step("sampling", 0, grid))
-    if method.adaptive:
+    if method.hybrid:
+        steps.append(Step("classify", 0, grid))
+    if method.takes_pilots:
+        steps.append(Step("pilot", 0, grid))
+    if method.samples:
+        steps.append(Step("sampling", 0, grid))
+    if method.filters:
+        steps += [Step("separable_h", 0, grid), Step("separable_v", 0, grid)]
+    if method.updates_history:
         steps.append(Step("update", 0, grid))
-    return [*steps, Step("combine", 0, grid)]
+    steps.append(Step("combine", 0, grid))
+    if method.overlay:
+        steps.append(Step("overlay", 0, grid))
+    if method.taa:
+        steps.append(Step("taa", 0, grid))
+    return steps

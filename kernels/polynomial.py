@@ -8,6 +8,8 @@ term left out is below half a unit in the last place.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import numpy.typing as npt
 
@@ -33,6 +35,8 @@ _THIRD, _FIFTH, _SEVENTH, _NINTH = _reciprocals(3, 5, 7, 9)
 _F3, _F4, _F5, _F6, _F7, _F8, _F9 = _reciprocals(6, 24, 120, 720, 5040, 40320, 362880)
 _GAMMA = _ONE / _F(2.2)
 _DARK = _F(2.0**-24)
+# Keeps the cube of an exponential above the denormals.
+_EXPONENT_MIN = _F(-28)
 
 
 def poly_log(x: Float) -> Float:
@@ -82,6 +86,15 @@ def poly_gamma(x: Float) -> Float:
     power = poly_exp(poly_log(np.maximum(x, _DARK)) * _GAMMA)
     result: Float = np.where(x < _DARK, _F(0), power)
     return result
+
+
+def burley(x: Any, w_wide: np.float32 = _ONE, w_narrow: np.float32 = _ONE) -> Any:
+    """w_wide e^x + w_narrow e^3x, x at least -28: with x = -r / (3 d) and weights 1, Burley's
+    profile but for its factor; with weights 3/4 and 1/4, the share of the energy scattered beyond
+    r.
+    """
+    wide = poly_exp(np.maximum(x, _EXPONENT_MIN))
+    return w_narrow * (wide * wide * wide) + w_wide * wide
 
 
 def poly_cos_sin(turn: npt.NDArray[np.uint32]) -> tuple[Float, Float]:

@@ -10,13 +10,13 @@ from __future__ import annotations
 
 import platform
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import metadata
 from typing import Any
 
 import numpy as np
 
-from kernels import program, resources
+from kernels import pilot, program, resources, separable, taa
 from kernels.access import Offsets, Program, States
 from kernels.device import Device, open_device
 from kernels.frame import Progress, Scene, advance, check_num_frames, gbuffer_of
@@ -118,6 +118,12 @@ def _most_rows(step: Step, method: Method, states: States) -> int:
         return 0
     if step.pass_name == "prefilter":
         states = step.grid.warp_states()
+    elif step.pass_name == "pilot":
+        states = pilot.warp_states(states, method)
+    elif step.pass_name == "taa":
+        states = taa.warp_states(states)
+    elif step.pass_name in ("separable_h", "separable_v"):
+        states = separable.warp_steps(states, method)
     elif step.pass_name == "sampling":
         states = np.where(states > 0, method.max_samples, states).astype(np.int32)
     return int(step.program(method, 0).row_offsets(states)[-1])
@@ -219,7 +225,9 @@ class _Recording:
         self._plan, self._scene, self._num_frames = plan, scene, num_frames
         self._progress = progress or (lambda share: None)
         self._pipeline = Pipeline(plan.method, first.width, first.height, device)
-        largest_cta = WARPS_PER_CTA * (8 + 3 * plan.method.max_samples)
+        method = plan.method
+        longest_loop = max(method.max_samples, method.num_pilots, method.num_taps, taa.NUM_STEPS)
+        largest_cta = WARPS_PER_CTA * (16 + 3 * longest_loop)
         self._max_rows = max(chunk_bytes // ROW_BYTES, largest_cta)
         self._pool = LanePool(device, self._max_rows)
 
@@ -255,7 +263,8 @@ class _Recording:
                 0,
                 max(1, sum(_most_rows(s, method, pipeline.states) for s in pipeline.steps)),
             )
-            for number, step in enumerate(pipeline.steps):
+            for number, whole_step in enumerate(pipeline.steps):
+                step = pipeline.listed(whole_step)
                 states = pipeline.states_of(step, frame)
                 if (frame, number) in self._plan.launch_of:
                     for part in self._launch(number, step, frame, states):
@@ -267,13 +276,17 @@ class _Recording:
 
     def _launch(self, number: int, step: Step, frame: int, states: States) -> Iterator[_Pending]:
         """Enqueue a traced launch in parts of whole CTAs that fit a buffer."""
+        # A launch over a list has as many CTAs as the list is long.
+        launch, num_ctas = self._plan.launch_of[frame, number], step.grid.num_ctas
+        self._plan.launches[launch] = replace(self._plan.launches[launch], num_ctas=num_ctas)
+        if not num_ctas:
+            return
         access = self._plan.programs[step.pass_name, frame % 2]
         offsets = access.row_offsets(states)
         rows_of_cta = offsets[::WARPS_PER_CTA]
         row_buffer = self._pipeline.upload(offsets[:-1].astype(np.uint32))
         state_buffer = self._pipeline.upload(states)
-        launch = self._plan.launch_of[frame, number]
-        cta, num_ctas = 0, step.grid.num_ctas
+        cta = 0
         while cta < num_ctas:
             end = (
                 int(np.searchsorted(rows_of_cta, rows_of_cta[cta] + self._max_rows, side="right"))

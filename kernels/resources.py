@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from kernels.gbuffer import GBuffer
 from kernels.method import Method
+from kernels.tiles import count_tiles
 from traces.texture import Texture
 
 HALF_MAX = np.float32(65504.0)
@@ -37,19 +38,50 @@ _FORMATS = {
     "albedo": "RGBA8",
     "scene_colour": "RGBA16F",
     "output": "RGBA16F",
+    "overlay": "RGBA16F",
+    "taa_0": "RGBA16F",
+    "taa_1": "RGBA16F",
+    "tex": "RGBA16F",
+    "importance": "R8",
+    "tile_class": "R8",
+    "tile_list": "R32F",  # tile x and y of 16 bits: the same 4 bytes
+    "pilot": "RGBA16F",
+    "covariance_0": "RGBA16F",
+    "covariance_1": "RGBA16F",
+    "past_counts_0": "RGBA32F",  # sixteen counts of a byte: the same 16 bytes
+    "past_counts_1": "RGBA32F",
 }
 TEXTURE_NAMES = tuple(_FORMATS)
+#: The textures with a texel per tile.
+_PER_TILE = ("tile_class", "tile_list")
+#: The textures that a frame hands to the next.
+CARRIED = (
+    *("history_0", "history_1", "taa_0", "taa_1"),
+    *("covariance_0", "covariance_1", "past_counts_0", "past_counts_1"),
+)
 
 
 def count_levels(width: int, height: int, method: Method) -> int:
     """Levels of the setup texture: at most 6, 1 without the pre-filter."""
-    return min(MAX_LEVELS, min(width, height).bit_length()) if method.prefilter else 1
+    has_mips = method.prefilter and method.samples
+    return min(MAX_LEVELS, min(width, height).bit_length()) if has_mips else 1
+
+
+def unused_by(method: Method) -> tuple[str, ...]:
+    """Textures of one estimator or control variate that a method does without."""
+    unused: tuple[str, ...] = () if method.takes_pilots else ("pilot",)
+    if not (method.updates_history and method.control == "online"):
+        unused += ("covariance_0", "covariance_1")
+    if not method.counts_past_frames:
+        unused += ("past_counts_0", "past_counts_1")
+    return unused
 
 
 def textures(width: int, height: int, num_levels: int) -> list[Texture]:
     """The descriptors, in the order of `TEXTURE_NAMES`."""
+    sizes = dict.fromkeys(_PER_TILE, count_tiles(width, height))
     return [
-        Texture(name, fmt, width, height, num_levels if name == "setup" else 1)
+        Texture(name, fmt, *sizes.get(name, (width, height)), num_levels if name == "setup" else 1)
         for name, fmt in _FORMATS.items()
     ]
 
@@ -79,7 +111,7 @@ def pack_normals(normal: Float) -> npt.NDArray[np.uint32]:
 
 def inputs(gbuffer: GBuffer) -> dict[str, npt.NDArray[Any]]:
     """The contents of the textures that the G-buffer fills, by name; `velocity` only where
-    something moves.
+    something moves, `overlay` and `importance` only where there is one.
     """
     found: dict[str, npt.NDArray[Any]] = {
         "scene_light": _with_alpha(np.maximum(gbuffer.irradiance, np.float32(0))),
@@ -91,4 +123,8 @@ def inputs(gbuffer: GBuffer) -> dict[str, npt.NDArray[Any]]:
     }
     if gbuffer.velocity is not None:
         found["velocity"] = gbuffer.velocity
+    if gbuffer.overlay is not None:
+        found["overlay"] = to_half(gbuffer.overlay)
+    if gbuffer.importance is not None:
+        found["importance"] = np.rint(gbuffer.importance * np.float32(255)).astype(np.uint8)
     return {name: np.ascontiguousarray(array) for name, array in found.items()}

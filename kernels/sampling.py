@@ -1,9 +1,13 @@
 """Sampling pass: filtered importance sampling around each scattering pixel, with a fixed or an
 estimated sample count.
 
-Facts sheet 2.3 to 2.7. The twin of sampling.cl and estimate.cl, operation by operation. Left out of
-the engine's estimator: its division by 0.99995, boundary colour bleed (there is one profile) and
-the opacity fade.
+Facts sheet 2.3 to 2.7. The twin of sampling.cl, operation by operation. Left out of the engine's
+estimator: its division by 0.99995, boundary colour bleed (there is one profile) and the opacity
+fade.
+
+Estimators without history need the variance between a pixel's own samples, see `kernels.spread`:
+the last-frame estimator's sampling pass writes it to the history texture. The pilot pass is the
+same kernel with few samples, which writes nothing else.
 """
 
 from __future__ import annotations
@@ -14,15 +18,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from kernels import resources
+from kernels import estimate, resources
 from kernels.access import Access
 from kernels.grid import Grid
+from kernels.history import history_names, reproject
 from kernels.method import Method
-from kernels.polynomial import poly_cbrt, poly_cos_sin, poly_exp, poly_log
+from kernels.patch import PATCH_PARTS, is_held, patch_accesses, patch_texels
+from kernels.polynomial import burley, poly_cbrt, poly_cos_sin, poly_log
 from kernels.profile import APPROXIMATE_C
 from kernels.sequence import pcg3d16, r2
 from kernels.setup import texels
-from kernels.update import has_history, history_names, read_history, reproject
+from kernels.spread import find_spread, weigh
 from traces.texture import INACTIVE_TEXEL, pack_texel
 
 if TYPE_CHECKING:
@@ -32,7 +38,6 @@ _F = np.float32
 _ONE = _F(1)
 _PDF_MIN = _F(1e-5)
 _RADIUS_MIN = _F(1e-5)
-_EXPONENT_MIN = _F(-28)
 _MM_PER_CM = _F(10)
 _C = _F(APPROXIMATE_C)
 #: The constant `a` of Eq 5.12, chosen by its author to damp the influence of the count.
@@ -82,8 +87,27 @@ class Constants:
         )
 
 
+#: Set in the hash's frame number for pilots, so that the samples proper are others.
+PILOT_FRAMES = 1 << 31
+
+
 def accesses(method: Method, frame: int) -> tuple[Access, ...]:
     """The pass's traced accesses."""
+    history = [Access(history_names(frame)[1], "store")] * method.guided_by_last_frame
+    before, loop = sample_accesses(method)
+    store = Access("scattered", "store")
+    return (
+        *patch_accesses(method),
+        *before,
+        *estimate.accesses(method, frame),
+        *loop,
+        store,
+        *history,
+    )
+
+
+def sample_accesses(method: Method) -> tuple[list[Access], list[Access]]:
+    """The traced reads of samples: before the loop, and in it."""
     colour = "colour" in method.planes
     normal = "normal" in method.planes and method.normal_weights
     planes = [Access("setup", in_loop=True)] * colour
@@ -91,58 +115,7 @@ def accesses(method: Method, frame: int) -> tuple[Access, ...]:
     planes += [Access("profile_id", in_loop=True)] * ("profile_id" in method.planes)
     found = [Access("setup")] * colour
     found += [Access("normal", subsurface_only=True)] * normal
-    if method.adaptive:
-        found += [
-            Access("velocity", subsurface_only=True),
-            Access(history_names(frame)[0], subsurface_only=True),
-        ]
-    store = Access("scattered", "store")
-    return (*found, *planes, store)
-
-
-def estimate_reference(
-    grid: Grid, textures: dict[str, Any], method: Method, frame: int
-) -> npt.NDArray[np.int32]:
-    """(num_warps, 32) samples of each lane; 0 where nothing scatters."""
-    depth = grid.gather(textures["setup"][0][..., 3]).astype(_F)
-    scatters = grid.inside & (depth > 0)
-    if not method.adaptive:
-        return np.where(scatters, method.num_samples, 0).astype(np.int32)
-    past_x, past_y, on_screen = reproject(grid, textures, scatters)
-    history = read_history(textures[history_names(frame)[0]], past_x, past_y, on_screen)
-    known = has_history(history, depth)
-    mean_count = np.where(known, history[..., 0], _F(method.b_max))
-    variance = np.where(known, history[..., 2], _F(method.sigma0_sq))
-    count = estimate_count(mean_count, variance, method)
-    return np.where(scatters, np.floor(count + _F(0.5)).astype(np.int32), 0)
-
-
-def estimate_count(mean_count: Any, variance: Any, method: Method) -> Any:
-    """The next frame's count before rounding, clamped to [b_min, b_max]; float32. Facts sheet
-    3.2.
-    """
-    s0 = _F(method.sigma0_sq)
-    if method.rule == "paper":
-        delta = (variance - s0) / s0 * mean_count * _F(k_minus_1(method))
-        count = _F(method.kappa) * delta + variance / s0 * mean_count
-    else:
-        count = variance / s0
-    return np.clip(count, _F(method.b_min), _F(method.b_max))
-
-
-def k_minus_1(method: Method) -> float:
-    """k - 1 for the simple moving average of k = 2 / alpha - 1 frames that the history's alpha
-    stands for.
-    """
-    return 2.0 / method.alpha - 2.0
-
-
-def burley(x: Any, w_wide: np.float32 = _ONE, w_narrow: np.float32 = _ONE) -> Any:
-    """w_wide e^x + w_narrow e^3x, x at least -28: with x = -r / (3 d) and weights 1, Burley's
-    profile but for its factor.
-    """
-    wide = poly_exp(np.maximum(x, _EXPONENT_MIN))
-    return w_narrow * (wide * wide * wide) + w_wide * wide
+    return found, planes
 
 
 def invert_cdf(complement: Any, exact: bool) -> Any:
@@ -173,12 +146,17 @@ def find_level(q: Any, num_levels: int) -> Any:
 
 def arguments(pipeline: Pipeline, level: int, frame: int) -> list[Any]:
     """The kernel's arguments between the warp's and the trace's."""
-    names = ("setup", "normal", "profile_id", "counts", "velocity", "scattered")
+    return arguments_for(pipeline, pipeline.method.num_samples, frame, "scattered")
+
+
+def arguments_for(pipeline: Pipeline, num_samples: int, frame: int, target: str) -> list[Any]:
+    """Those of a run with a fixed count, num_samples (unless counts adapt), into a texture."""
+    names = ("setup", "normal", "profile_id", "counts", "velocity", target)
     constants = pipeline.constants
     return [
         *(pipeline.buffers[name] for name in names),
         pipeline.has_velocity,
-        np.int32(pipeline.method.num_samples),
+        np.int32(num_samples),
         np.uint32(frame),
         np.int32(pipeline.num_levels),
         pipeline.buffers["ratio"],
@@ -187,21 +165,9 @@ def arguments(pipeline: Pipeline, level: int, frame: int) -> list[Any]:
         *constants.rate,
         *constants.density,
         constants.mip_scale,
-    ]
-
-
-def estimate_arguments(pipeline: Pipeline, frame: int) -> list[Any]:
-    """The same of the estimate kernel, whose reads the sampling kernel traces as its own."""
-    names = ("setup", "velocity", history_names(frame)[0], "counts")
-    method = pipeline.method
-    return [
-        *(pipeline.buffers[name] for name in names),
-        pipeline.has_velocity,
-        np.float32(method.sigma0_sq),
-        np.float32(method.kappa),
-        np.float32(k_minus_1(method)),
-        np.float32(method.b_min),
-        np.float32(method.b_max),
+        pipeline.buffers[history_names(frame)[1]],
+        np.float32(pipeline.method.epsilon_u or 0.0),
+        *(pipeline.buffers[name] for name in ("setup", "normal", "profile_id") * len(PATCH_PARTS)),
     ]
 
 
@@ -213,11 +179,12 @@ def reference(
     num_levels: int,
     frame: int,
     counts: npt.NDArray[np.int32],
+    pilots: bool = False,
 ) -> list[Texels]:
-    """Write `scattered`; the texels of each access, those of the loop (num_steps, num_warps,
-    32).
+    """Write `scattered` (with `pilots`, `pilot` instead); the texels of each access, those of the
+    loop (num_steps, num_warps, 32).
     """
-    from kernels.reference import scatter
+    from kernels.reference import scatter, scatter_into
 
     x, y = grid.lanes
     centre = np.where(grid.inside[..., None], grid.gather(textures["setup"][0]), 0).astype(_F)
@@ -232,9 +199,10 @@ def reference(
     beyond = [burley(radius_centre * rate, _F(0.75), _F(0.25)) for rate in constants.rate]
     unit = _F(2.0**-24) * (beyond[3] if method.centre_reweighting else _ONE)
 
-    start = pcg3d16(x, y, frame, method.hash)[0]
+    start = pcg3d16(x, y, frame | PILOT_FRAMES if pilots else frame, method.hash)[0]
     sums = [np.zeros(x.shape, _F) for _ in range(3)]
     totals = [np.zeros(x.shape, _F) for _ in range(3)]
+    moments = [np.zeros(x.shape, _F) for _ in range(5)]
     fetched: list[list[Texels]] = [[], [], []]
     for i in range(int(counts.max())):
         active = i < counts
@@ -277,12 +245,22 @@ def reference(
         if method.bilateral:
             dz = (colour[..., 3] - centre[..., 3]) * _MM_PER_CM
             reach = np.sqrt(r * r + dz * dz)
-        for c in range(3):
-            weight = burley(reach * constants.rate[c]) * constants.density[c] * common
+        weights = [
+            burley(reach * constants.rate[c]) * constants.density[c] * common for c in range(3)
+        ]
+        for c, weight in enumerate(weights):
             sums[c] = sums[c] + weight * colour[..., c]
             totals[c] = totals[c] + weight
-        own = np.where(active, pack_texel(0, texel_y, texel_x), INACTIVE_TEXEL)
-        fetched[0].append(np.where(active, pack_texel(level, level_y, level_x), INACTIVE_TEXEL))
+        part = weigh(*(weight * colour[..., c] for c, weight in enumerate(weights)))
+        normal = method.weights == "self-normalised"
+        share = weigh(*weights) if normal else np.where(active, _ONE, _F(0))
+        terms = (part, share, part * part, part * share, share * share)
+        moments = [moment + term for moment, term in zip(moments, terms, strict=True)]
+        fetches = active
+        if method.lds and not pilots:
+            fetches = active & ~((level == 0) & is_held(x, y, texel_x, texel_y))
+        own = np.where(fetches, pack_texel(0, texel_y, texel_x), INACTIVE_TEXEL)
+        fetched[0].append(np.where(fetches, pack_texel(level, level_y, level_x), INACTIVE_TEXEL))
         fetched[1].append(own)
         fetched[2].append(own)
 
@@ -299,21 +277,36 @@ def reference(
                 if method.centre_reweighting:
                     value = value * beyond[3] + centre[..., c] * (_ONE - share)
             result[..., c] = value
+        if pilots or method.guided_by_last_frame:
+            spread, mean = find_spread(moments, result, centre, beyond, counts, method)
+            texel = np.stack([counts.astype(_F), centre[..., 3], spread, mean], axis=-1)
+            texel = np.where(scatters[..., None], texel, _F(0))
+            name = "pilot" if pilots else history_names(frame)[1]
+            textures[name] = scatter(grid, resources.to_half(texel))
     result[..., 3] = counts
-    result = np.where(scatters[..., None], result, _F(0))
-    textures["scattered"] = scatter(grid, resources.to_half(result))
+    if not pilots:
+        # With separation, what takes no samples keeps its light; elsewhere that is 0 already.
+        unsampled = np.where(np.arange(4) < 3, centre, _F(0)) if method.separates else _F(0)
+        result = np.where(scatters[..., None], result, unsampled)
+        textures["scattered"] = scatter_into(textures["scattered"], grid, resources.to_half(result))
 
     found: list[Texels] = []
     loop = iter(np.array(plane) for plane in fetched)
     colour_loop, normal_loop, id_loop = loop
     past_x, past_y, on_screen = reproject(grid, textures, scatters)
     past = np.where(on_screen, pack_texel(0, past_y, past_x), INACTIVE_TEXEL)
-    for access in accesses(method, frame):
+    patch = dict(zip(PATCH_PARTS, patch_texels(grid), strict=True))
+    before, planes = sample_accesses(method)
+    recorded = (*before, *planes, Access("pilot", "store")) if pilots else accesses(method, frame)
+    for access in recorded:
         by_name = {"setup": colour_loop, "normal": normal_loop, "profile_id": id_loop}
-        if access.in_loop:
+        if access.of_tile:
+            found.append(patch[access.argument.split("_")[0]])
+        elif access.in_loop:
             found.append(by_name[access.texture])
-        elif access.texture in ("setup", "scattered"):
+        elif not access.subsurface_only:
             found.append(everywhere)
         else:
-            found.append(past if access.texture.startswith("history") else mine)
+            is_past = access.texture.startswith(("history", "past_counts"))
+            found.append(past if is_past else mine)
     return found

@@ -38,7 +38,7 @@ def pytest_generate_tests(metafunc):
 def pytest_collection_modifyitems(items):
     """Mark what takes `device` as `opencl`, so that `-m 'not opencl'` leaves it out."""
     for item in items:
-        if "device" in getattr(item, "fixturenames", ()):
+        if {"device", "first_device"} & set(getattr(item, "fixturenames", ())):
             item.add_marker("opencl")
 
 
@@ -49,6 +49,16 @@ def pytest_runtest_setup(item):
         if os.environ.get(REQUIRE_OPENCL):
             pytest.fail(f"{reason}, and {REQUIRE_OPENCL} is set", pytrace=False)
         pytest.skip(reason)
+
+
+@pytest.fixture(scope="session")
+def first_device():
+    """The device that runs where none is named, for what the comparisons with the reference hold
+    every device to.
+    """
+    from kernels.device import open_device
+
+    return open_device()
 
 
 @pytest.fixture

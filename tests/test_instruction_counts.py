@@ -58,7 +58,12 @@ def test_every_segment_holds_known_kinds_and_positive_counts(target):
             outside = [a for a in accesses if not a.in_loop]
             in_loop = len(accesses) - len(outside)
             num_always = sum(not a.subsurface_only for a in outside)
-            assert 0 < counts.registers_per_thread <= 255 and counts.shared_bytes == 0
+            # The reduction over a tile: 16 bytes a thread; the patch: colour, normal and id.
+            has_patch = kernel == "sampling" and method.lds
+            texel_bytes = 8 + 4 * method.normal_weights + 1
+            shared_bytes = 64 * 16 if kernel == "classify" else 100 * texel_bytes * has_patch
+            assert counts.shared_bytes == shared_bytes
+            assert 0 < counts.registers_per_thread <= 255
             assert len(counts.elsewhere) == num_always + 1
             assert len(counts.before) + max(0, len(counts.after) - 1) == len(outside) + 1
             assert len(counts.loop) == len(counts.first_turn) == (in_loop and in_loop + 1)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from kernels import profile, sampling
+from kernels import estimate, profile, sampling
 from kernels.method import Method
 from kernels.profile import SKIN, Profile
 from kernels.sequence import pcg3d16, r2
@@ -119,9 +119,9 @@ def test_float32_inverse_agrees_with_float64(xi, exact):
 )
 def test_paper_rule(ratio, kappa, count):
     method = Method(kind="adaptive", kappa=kappa)
-    assert sampling.k_minus_1(method) + 1 == pytest.approx(9)
+    assert estimate.k_minus_1(method) + 1 == pytest.approx(9)
     variance = np.float32(ratio * method.sigma0_sq)
-    found = sampling.estimate_count(np.float32(16), variance, method)
+    found = estimate.estimate_count(np.float32(16), variance, method)
     assert found == pytest.approx(count, rel=1e-5)
 
 
@@ -129,14 +129,14 @@ def test_undamped_paper_rule_equals_the_sliding_form():
     method = Method(kind="adaptive", kappa=1.0, b_min=1, b_max=2048)
     for mean_count, ratio in [(10, 1.1), (30, 1.5), (64, 0.95)]:
         variance = np.float32(ratio * method.sigma0_sq)
-        found = sampling.estimate_count(np.float32(mean_count), variance, method)
+        found = estimate.estimate_count(np.float32(mean_count), variance, method)
         assert found == pytest.approx((ratio - 1) * mean_count * 9 + mean_count, rel=1e-4)
 
 
 @pytest.mark.parametrize(("variance", "count"), [(0.0, 8), (0.0012, 12), (0.01, 64)])
 def test_engine_rule(variance, count):
     method = Method(kind="adaptive", rule="engine", sigma0_sq=1e-4)
-    found = sampling.estimate_count(np.float32(30), np.float32(variance), method)
+    found = estimate.estimate_count(np.float32(30), np.float32(variance), method)
     assert found == pytest.approx(count, rel=1e-5)
 
 

@@ -134,7 +134,9 @@ def test_arguments_stand_at_their_natural_alignment():
     }
     sampling = argument_offsets(program.source("sampling"), "sampling")
     assert list(sampling.values())[3:] == [
-        *("setup_texture", "normal", "profile_id", "counts", "velocity", "scattered", "ratio")
+        *("setup_texture", "normal", "profile_id", "counts", "velocity", "scattered", "ratio"),
+        *("history", "patch_setup", "patch_normal", "patch_id"),
+        *("rest_setup", "rest_normal", "rest_id"),
     ]
 
 

@@ -73,6 +73,7 @@ gbuffer = GBuffer(
     normal=np.broadcast_to(np.float32([0, 0, 1]), (height, width, 3)).copy(),
     profile_id=skin.astype(np.uint8),
     projection_x=40.0,
+    importance=(x > 12).astype(np.float32),
 )
 method = Method(num_samples=8, b_min=2, b_max=8, **json.loads(sys.argv[1]))
 render(gbuffer, method, num_frames=2)
@@ -96,6 +97,19 @@ METHODS = {
         "tile_order": "morton",
         "lane_map": "quad2x2",
     },
+    "control": {"kind": "adaptive", "control": "online", "epsilon_u": 0.3, "rule": "sliding"},
+    "two-pass": {"kind": "adaptive", "estimator": "two-pass", "num_pilots": 3},
+    "last-frame": {"kind": "adaptive", "estimator": "last-frame", "disocclusion": "none"},
+    "separable": {"kind": "separable", "num_taps": 5},
+    "hybrid": {"kind": "hybrid", "num_taps": 3, "hybrid_rules": ["painted", "count"]},
+    "hybrid-fixed": {
+        "kind": "hybrid",
+        "num_taps": 3,
+        "hybrid_count": "fixed",
+        "hybrid_rules": ["painted"],
+        "tile_order": "morton",
+    },
+    "patch": {"lds": True, "kind": "hybrid", "hybrid_rules": ["painted", "count"], "num_taps": 3},
     "plain": {
         "mip_rule": "mip0",
         "centre_reweighting": False,
@@ -138,3 +152,10 @@ def test_the_procedural_head_renders_clean(tmp_path):
 @pytest.mark.parametrize("name", METHODS)
 def test_every_pass_renders_and_records_clean(name, tmp_path):
     assert errors_under_oclgrind(RECORD, tmp_path, json.dumps(METHODS[name])) == ""
+
+
+@pytest.mark.parametrize("name", ["patch", "fixed"])
+def test_one_lane_per_work_item_is_clean(name, tmp_path):
+    """As on GPUs; with a patch, two warps then share local memory."""
+    code = f"from kernels import program\nprogram.lanes_per_item = lambda *_: 1\n{RECORD}"
+    assert errors_under_oclgrind(code, tmp_path, json.dumps(METHODS[name])) == ""

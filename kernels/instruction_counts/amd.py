@@ -91,7 +91,8 @@ def _decode(text: str) -> MachineInstruction:
     kind = _kind(opcode)
     is_store = kind == MEMORY and "_store" in opcode
     is_load = kind == MEMORY and "_load" in opcode
-    compares = re.match(r"v_cmp|s_cmp|s_bitcmp", opcode)
+    # The others write a mask, which may stand in a scalar register.
+    compares = re.match(r"v_cmpx|s_cmp|s_bitcmp", opcode)
     writes_nothing = is_store or compares or opcode.startswith(("s_cbranch", "s_branch"))
     written = () if writes_nothing else _registers(operands[0])
     num_written = bool(written) + bool(_CARRIES.match(opcode))

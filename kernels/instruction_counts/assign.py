@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
+from kernels import classify
 from kernels.access import Access
 from kernels.instruction_counts.data import Counts, counts_of
 from kernels.instruction_counts.segments import Segment, join
@@ -46,8 +47,10 @@ def count_pass(
     first = [i for i in outside if not loop or i < loop[0]]
     last = [i for i in outside if i not in first]
     before = counts.before
-    if pass_name == "sampling" and method.adaptive:
-        before = _insert_estimate(before, method, target)
+    reads_estimate = pass_name == "sampling" and method.adaptive
+    if reads_estimate or (pass_name == "classify" and classify.reads_history(method)):
+        place = len(before) - 1 if pass_name == "sampling" else 1
+        before = _insert_estimate(before, place, method, target)
 
     always = [i for i in outside if not accesses[i].subsurface_only]
     stream = _Stream(accesses, is_recorded)
@@ -78,14 +81,14 @@ def count_pass(
 
 
 def _insert_estimate(
-    before: tuple[Segment, ...], method: Method, target: str
+    before: tuple[Segment, ...], place: int, method: Method, target: str
 ) -> tuple[Segment, ...]:
-    """The sampling pass's segments with those of the estimate, whose reads the trace holds behind
-    the others before the loop. What both do to find the pixel and its depth counts once.
+    """A pass's segments with those of the estimate, whose reads the trace holds behind the first
+    `place` of the pass's own. What both do to find the pixel and its depth counts once.
     """
     estimate: Counts = counts_of("estimate", method, target)
     _, *between, rest = estimate.before
-    return (*before[:-1], *between, join(rest, before[-1]))
+    return (*before[:place], *between, join(rest, before[place]), *before[place + 1 :])
 
 
 class _Stream:

@@ -14,7 +14,7 @@ import sys
 from dataclasses import replace
 from typing import Any
 
-from kernels import program
+from kernels import estimate, program
 from kernels.access import Access
 from kernels.instruction_counts.compile import TARGETS, TOOLCHAIN, Toolchain
 from kernels.instruction_counts.data import data_file
@@ -30,22 +30,28 @@ _ARGUMENT = {
     ("", "setup"): "setup_texture",
     ("update", "history_1"): "old_history",
     ("update", "history_0"): "history",
+    ("update", "covariance_1"): "old_covariance",
+    ("update", "covariance_0"): "covariance",
+    ("update", "past_counts_1"): "old_past_counts",
+    ("update", "past_counts_0"): "past_counts",
     ("estimate", "history_1"): "history",
+    ("estimate", "past_counts_1"): "past_counts",
+    ("estimate", "pilot"): "history",
+    ("pilot", "pilot"): "scattered",
+    ("sampling", "history_0"): "history",
     ("combine", "resolved"): "scattered",
+    ("overlay", "overlay"): "overlay_texture",
+    ("taa", "taa_1"): "old_taa",
+    ("taa", "taa_0"): "new_taa",
 }
-#: What the estimate kernel reads; the recorder traces it as reads of the sampling pass.
-_ESTIMATE = (
-    Access("setup"),
-    Access("velocity", subsurface_only=True),
-    Access("history_1", subsurface_only=True),
-)
 
 
 def argument_offsets(text: str, kernel: str) -> dict[int, str]:
     """The pointer arguments of a kernel by byte offset, from its declaration."""
     text = re.sub(r"\\\n", " ", re.sub(r"//[^\n]*", "", text))
     shared = re.search(r"#define WARP_ARGS (.*)", text)
-    declared = re.search(rf"(?:PASS_KERNEL|void)\s+{kernel}\s*\((.*?)\)\s*\{{", text, re.S)
+    function = program.FUNCTIONS.get(kernel, kernel)
+    declared = re.search(rf"(?:PASS_KERNEL|void)\s+{function}\s*\((.*?)\)\s*\{{", text, re.S)
     if not shared or not declared:
         raise CountError(f"{kernel}: its declaration is not found")
     arguments = declared[1].replace("WARP_ARGS", shared[1]).replace("TRACE_ARGS", "")
@@ -114,8 +120,10 @@ def _touching(flow: Flow, way: Way, arguments: dict[int, str], wanted: set[str])
 
 def _key(kernel: str, access: Access) -> str:
     texture = access.texture
-    name = _ARGUMENT.get((kernel, texture)) or _ARGUMENT.get(("", texture), texture)
-    return f"{access.operation} {name}"
+    name = (
+        access.argument or _ARGUMENT.get((kernel, texture)) or _ARGUMENT.get(("", texture), texture)
+    )
+    return f"{access.operation} {access.argument or name}"
 
 
 def _texts(segments: list[Segment]) -> list[str]:
@@ -125,11 +133,12 @@ def _texts(segments: list[Segment]) -> list[str]:
 def accesses_of(kernel: str, method: Method) -> tuple[Access, ...]:
     """All accesses of a kernel, whether a recording holds them or not."""
     if kernel == "estimate":
-        return _ESTIMATE
+        return (Access("setup"), *estimate.accesses(replace(method, kind="adaptive"), 0))
+    # The recorder traces what the estimate reads as reads of the sampling pass.
+    of_estimate = estimate.accesses(method, 0)
     found = PASSES[kernel].accesses(replace(method, planes=PLANES), 0)
     if kernel == "sampling":
-        # Those of the estimate are not in this kernel.
-        found = tuple(a for a in found if a.texture not in ("velocity", "history_1"))
+        found = tuple(access for access in found if access not in of_estimate)
     return found
 
 
@@ -148,7 +157,7 @@ def count_target(toolchain: Toolchain, target: str) -> dict[str, Any]:
             key = name, macros_of(method)
             if key not in compiled:
                 compiled[key] = toolchain.compile(text, target, key[1])
-            code = compiled[key][kernel]
+            code = compiled[key][program.FUNCTIONS.get(kernel, kernel)]
             try:
                 entry = count_kernel(code, text, kernel, accesses_of(kernel, method))
             except CountError as error:
