@@ -58,7 +58,7 @@ def command(
     title = f"{gbuffer.name}, {width}x{height}, {machine.name}"
     totals, mips = study.totals_frame(runs), study.mips_frame(runs)
     shown = {
-        "cache-table": (study.totals_table(totals, runs, machine, title), totals),
+        "cache-table": (study.totals_table(totals, machine, title), totals),
         "cache-table-mips": (study.mips_table(mips, title), mips),
     }
     for name, (table, data) in shown.items():

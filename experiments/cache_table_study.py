@@ -80,15 +80,33 @@ def measure(
     """
     runs = []
     for path in FETCH_PATHS:
-        for mips, changes in MIPS.items():
+        for mips in MIPS:
             for kind in METHODS:
                 step(f"{path}, {mips}, {kind}")
-                method = replace(shared, kind=kind, **changes)
-                count = num_frames if method.adaptive else 1
-                trace = record(gbuffer, method, num_frames=count, device=device, self_check=False)
-                report = simulate(trace, gpu, fetch_path=path, timing=True)
-                runs.append(Run(path, mips, kind, report))
+                runs.append(
+                    measure_run(
+                        gbuffer, gpu, shared, path, mips, kind, num_frames=num_frames, device=device
+                    )
+                )
     return runs
+
+
+def measure_run(
+    gbuffer: GBuffer,
+    gpu: Gpu,
+    shared: Method,
+    fetch_path: str,
+    mips: str,
+    kind: str,
+    *,
+    num_frames: int,
+    device: Device | None = None,
+) -> Run:
+    """Record and time one of the combinations of `measure`."""
+    method = replace(shared, kind=kind, **MIPS[mips])
+    count = num_frames if method.adaptive else 1
+    trace = record(gbuffer, method, num_frames=count, device=device, self_check=False)
+    return Run(fetch_path, mips, kind, simulate(trace, gpu, fetch_path=fetch_path, timing=True))
 
 
 def totals_frame(runs: Sequence[Run]) -> pd.DataFrame:
@@ -137,7 +155,7 @@ def ratio_rows(totals: pd.DataFrame) -> pd.DataFrame:
     return ratios
 
 
-def totals_table(totals: pd.DataFrame, runs: Sequence[Run], gpu: Gpu, title: str) -> Table:
+def totals_table(totals: pd.DataFrame, gpu: Gpu, title: str) -> Table:
     """Fixed, adaptive and their ratio, with a word on each fetch path's L1."""
     ratios = ratio_rows(totals).set_index(["fetch_path", "mips", "passes"])
     numbers = {"cycles": ",.0f", "l1_accesses": ",.0f", "l2_accesses": ",.0f"}
@@ -168,7 +186,7 @@ def totals_table(totals: pd.DataFrame, runs: Sequence[Run], gpu: Gpu, title: str
     notes = [
         "Demand: sectors asked of the level (32 B here as in GPGPU-Sim). ratio: adaptive / fixed. "
         "frame: all passes, of which only adaptive has an update.",
-        *(l1_verdict(gpu, path, _l1_accesses(runs, path)) for path in FETCH_PATHS),
+        *(l1_verdict(gpu, path, _l1_accesses(totals, path)) for path in FETCH_PATHS),
         *findings(ratio_rows(totals)),
         PRINTED,
     ]
@@ -179,8 +197,9 @@ def _number(value: Any) -> float | None:
     return None if value is None else float(value)
 
 
-def _l1_accesses(runs: Sequence[Run], path: str) -> int:
-    return sum(r.report.counters["l1"].accesses for r in runs if r.fetch_path == path)
+def _l1_accesses(totals: pd.DataFrame, path: str) -> int:
+    of_frames = totals[(totals["fetch_path"] == path) & (totals["passes"] == "frame")]
+    return int(of_frames["l1_accesses"].sum())
 
 
 def l1_verdict(gpu: Gpu, path: str, l1_accesses: int) -> str:

@@ -3,9 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
+
+from experiments.options import DeviceName
+
+if TYPE_CHECKING:
+    from experiments.console import Progress
 
 app = typer.Typer(
     name="validate",
@@ -65,3 +70,64 @@ def accel_sim(
         figure = correlation_figure(frame)
         for suffix in (".png", ".pdf"):
             write_figure(folder / f"accel-sim{suffix}", figure)
+
+
+@app.command("silicon")
+def silicon(
+    file: Annotated[
+        Path | None,
+        typer.Argument(metavar="FILE", help="Of `silicon measure`, or `ncu --csv --page raw`."),
+    ] = None,
+    gpu: Annotated[
+        str | None,
+        typer.Option("--gpu", metavar="NAME|FILE.toml", help="The measured GPU's unless given."),
+    ] = None,
+    picture: Annotated[
+        list[str] | None,
+        typer.Option("--picture", metavar="NAME", help="Only this picture: front_480x270, …"),
+    ] = None,
+    cycles: Annotated[
+        bool, typer.Option("--cycles/--no-cycles", help="Run the model with its clock too.")
+    ] = True,
+    device: DeviceName = None,
+    output: Annotated[
+        Path | None,
+        typer.Option("-o", "--output", metavar="DIR", help="Also the tables and the plot."),
+    ] = None,
+) -> None:
+    """The model beside a measured GPU: per launch and level, means, correlation."""
+    from experiments.console import progress, remark
+    from experiments.output import input_file, output_folder, write_figure
+    from experiments.silicon import compare
+    from experiments.silicon import validate as study
+    from experiments.tables import print_table, write_table
+
+    paths = [input_file(file)] if file is not None else compare.committed_files()
+    if not paths:
+        print(study.NOT_MEASURED)
+        return
+    folder = output_folder(output) if output is not None else None
+    for path in paths:
+        chosen = study.choose_cases(compare.read_measured(path), picture or ())
+        minutes = study.expect_minutes(chosen, cycles)
+        remark(f"{path.name}: {len(chosen)} launches, up to about {minutes:.0f} minutes")
+        with progress("compiling the simulator", len(chosen)) as bar:
+
+            def step(text: str, bar: Progress = bar) -> None:
+                bar.describe(text)
+                bar.advance()
+
+            found = study.run_comparison(path, gpu, picture or (), cycles, device, step)
+        launches = compare.launches_table(found.frame, found.measured.notes)
+        summary = compare.summary_table(found.summary)
+        print_table(launches)
+        print_table(summary)
+        if folder is not None:
+            from experiments.silicon.compare_plots import correlation_figure
+
+            stem = f"silicon-{path.stem}"
+            write_table(launches, folder / stem, data=found.frame)
+            write_table(summary, folder / f"{stem}-summary", data=found.summary)
+            figure = correlation_figure(found.frame, found.measured.device)
+            for suffix in (".png", ".pdf"):
+                write_figure(folder / f"{stem}{suffix}", figure)

@@ -101,7 +101,7 @@ def test_ratios_are_adaptive_over_fixed_and_missing_where_nothing_was_asked():
 
 
 def test_the_table_shows_a_dash_where_there_is_no_rate():
-    table = study.totals_table(made_totals(), [], presets.load(GPU), "made")
+    table = study.totals_table(made_totals(), presets.load(GPU), "made")
     assert [row["l1_miss_rate"] for _, row in table.frame.iterrows()] == ["-"] * 6
     assert "| ratio    |  0.250 |" in markdown(table)
 

@@ -1,0 +1,1 @@
+"""Measuring a real NVIDIA GPU, and the model beside what was measured."""
