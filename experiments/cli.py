@@ -30,11 +30,13 @@ from experiments import (
     presets,
     record,
     render,
+    reproduce,
     run,
     sensitivity,
     sweep,
     validate,
 )
+from experiments.silicon import command as silicon
 from traces.errors import InputError, WorkError
 
 DONE, FAILED, BAD_INPUT, INTERRUPTED = 0, 1, 2, 130
@@ -52,6 +54,7 @@ for module in (
     demo,
     cache_table,
     p4000_times,
+    reproduce,
     prefilter,
     record,
     run,
@@ -71,6 +74,7 @@ for module in (
 ):
     app.command(module.__name__.rpartition(".")[2].replace("_", "-"))(module.command)
 app.add_typer(validate.app)
+app.add_typer(silicon.app)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
