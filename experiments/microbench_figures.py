@@ -46,6 +46,9 @@ LATENCY: dict[tuple[str, str], Figure] = {
     ("h100-sxm", "l1"): Figure(33, f"{_GH200}: 32 to 34"),
     ("h100-sxm", "l2"): Figure(280, f"{_GH200}, near half"),
     ("h100-sxm", "dram"): Figure(680, f"{_GH200}: 680 to 689"),
+    ("h200", "l1"): Figure(33, f"{_GH200}: 32 to 34"),
+    ("h200", "l2"): Figure(280, f"{_GH200}, near half"),
+    ("h200", "dram"): Figure(680, f"{_GH200}: 680 to 689"),
 }
 #: (preset, level) -> bandwidth, in the units above.
 BANDWIDTH: dict[tuple[str, str], Figure] = {
@@ -73,4 +76,7 @@ BANDWIDTH: dict[tuple[str, str], Figure] = {
     ("h100-sxm", "l1"): Figure(127, "gpu-benches: 126 to 128"),
     ("h100-sxm", "l2"): Figure(5016, f"{_GH200}: 37 to 39 B per SM"),
     ("h100-sxm", "dram"): Figure(3350, _BOARD, True),
+    ("h200", "l1"): Figure(127, "gpu-benches: 126 to 128"),
+    ("h200", "l2"): Figure(5016, f"{_GH200}: 37 to 39 B per SM"),
+    ("h200", "dram"): Figure(4800, _BOARD, True),
 }

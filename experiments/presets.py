@@ -10,6 +10,8 @@ from experiments.options import Overrides
 from traces.errors import InputError, unknown
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from experiments.tables import Table
 
 ACTIONS = {"list": 0, "show": 1, "diff": 2}
@@ -78,7 +80,7 @@ def list_table() -> Table:
         Column("llc", "LLC"),
         Column("layout", "texture layout"),
     )
-    return Table("Presets", pd.DataFrame(rows), columns)
+    return Table("Presets", pd.DataFrame(rows), columns, (_against_silicon(presets.names()),))
 
 
 def show_table(name: str, overrides: list[str]) -> Table:
@@ -97,7 +99,19 @@ def show_table(name: str, overrides: list[str]) -> Table:
         Column("confidence", "grade"),
         Column("source", "source", wraps=True),
     )
-    return Table(name, fields, columns, (CONFIDENCES,))
+    return Table(name, fields, columns, (CONFIDENCES, _against_silicon([name])))
+
+
+def _against_silicon(names: Sequence[str]) -> str:
+    """Which of these GPUs were measured with `cachesim silicon`."""
+    from experiments.silicon.compare import NOT_MEASURED, silicon_of
+
+    found = silicon_of()
+    told = [f"{name} {found[name]}" for name in names if name in found]
+    rest = [name for name in names if name not in found]
+    if rest:
+        told.append(NOT_MEASURED if rest == list(names) else f"the others {NOT_MEASURED}")
+    return f"Against silicon (`cachesim validate silicon`): {', '.join(told)}"
 
 
 def diff_table(first: str, second: str) -> Table:

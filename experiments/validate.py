@@ -104,7 +104,7 @@ def silicon(
 
     paths = [input_file(file)] if file is not None else compare.committed_files()
     if not paths:
-        print(study.NOT_MEASURED)
+        print(compare.NOT_MEASURED)
         return
     folder = output_folder(output) if output is not None else None
     for path in paths:

@@ -300,6 +300,7 @@ def test_presets_list_show_and_diff(capsys: pytest.CaptureFixture[str]) -> None:
     assert run_command(["presets", "show", "rtx-2080-ti", "--set", "l1.capacity=32KiB"]) == 0
     shown = capsys.readouterr().out
     assert "32 KiB" in shown and "l2.partition_hash" in shown
+    assert "Against silicon (`cachesim validate silicon`): not measured" in shown
     assert run_command(["presets", "diff", "rtx-2060", "rtx-2080-ti"]) == 0
     differences = capsys.readouterr().out
     assert "5.5 MiB" in differences and "l1.capacity" not in differences

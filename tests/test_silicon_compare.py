@@ -14,6 +14,7 @@ from experiments.cli import run_command
 from experiments.silicon import compare
 from experiments.silicon.cases import Case
 from experiments.silicon.compare import (
+    PRESETS,
     QUANTITIES,
     modelled_of,
     preset_of,
@@ -177,6 +178,8 @@ def test_the_plot_has_a_point_per_launch():
 
 def test_a_devices_name_finds_its_preset():
     assert preset_of("NVIDIA H100 80GB HBM3") == "h100-sxm"
+    assert preset_of("NVIDIA H200") == "h200"
+    assert {name for _, name in PRESETS} <= set(presets.names())
     with pytest.raises(InputError, match="'NVIDIA L4': no preset for it"):
         preset_of("NVIDIA L4")
 

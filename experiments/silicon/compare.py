@@ -53,6 +53,8 @@ PRESETS = (
     (r"RTX 2080 Ti", "rtx-2080-ti"),
     (r"RTX 2060", "rtx-2060"),
 )
+#: Said of a GPU without committed measurements.
+NOT_MEASURED = "not measured"
 Values = dict[str, float]
 
 
@@ -69,6 +71,15 @@ def committed_files() -> list[Path]:
     """The measurements that are committed, by name."""
     folder = Path(str(resources.files("experiments.silicon"))) / "data"
     return sorted(folder.glob("*.csv")) if folder.is_dir() else []
+
+
+def silicon_of() -> dict[str, str]:
+    """Preset -> names of the committed measurements of its GPU."""
+    found: dict[str, str] = {}
+    for path in committed_files():
+        name = preset_of(read_measured(path).device)
+        found[name] = ", ".join(filter(None, (found.get(name), path.name)))
+    return found
 
 
 def read_measured(path: Path) -> Measured:
@@ -179,11 +190,9 @@ def preset_of(device: str) -> str:
     Raises:
         InputError: none fits.
     """
-    from cachesim import presets
-
     for pattern, name in PRESETS:
         if re.search(pattern, device):
-            return name if name in presets.names() else "h100-sxm"
+            return name
     raise InputError(f"device {device!r}: no preset for it: name one with --gpu")
 
 

@@ -17,7 +17,6 @@ from traces.errors import InputError, unknown
 if TYPE_CHECKING:
     from cachesim.config import Gpu
 
-NOT_MEASURED = "not measured"
 #: Seconds per million samples of one lane that the model takes, with a clock and without: for the
 #: remark about how long it will take.
 _SECONDS_PER_MEGASAMPLE = {True: 1.6, False: 0.25}
