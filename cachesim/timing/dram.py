@@ -12,7 +12,7 @@ from cachesim.compiled import compiled, small
 from cachesim.timing.access import DOWN, drop_request
 from cachesim.timing.bits import bit_at, lowest
 from cachesim.timing.records import MAX_DRAM_BANKS, NEVER, WRITEBACK
-from cachesim.timing.slice import come_back
+from cachesim.timing.slice import come_back, took_down
 
 _LINK = 4
 U64 = np.uint64
@@ -304,9 +304,7 @@ def _take_from_slices(state, tags, index):  # type: ignore[no-untyped-def]
         if channel.pending >= machine.dram_queue:
             return
         request = tags.queues[node, DOWN, home.down_head & (tags.queues.shape[2] - 1)]
-        home.down_head += 1
-        home.down_count -= 1
-        home.wake = min(home.wake, machine.now)
+        took_down(tags, node, machine.now)
         one = state.pool.requests[request]
         one.lower = node
         one.pending = machine.bursts

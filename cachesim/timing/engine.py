@@ -16,7 +16,7 @@ from cachesim.timing.network import AT_INPUTS, arrival, has_room, pop, push, tra
 from cachesim.timing.partition import is_filling_table, locate
 from cachesim.timing.pipe import inject
 from cachesim.timing.records import NEVER, PATH_FIFO, S_REPLY, S_REQUEST, WRITEBACK
-from cachesim.timing.slice import arrive, come_back, step_cache
+from cachesim.timing.slice import arrive, come_back, step_cache, took_down, took_out
 from cachesim.timing.sm import place_ctas, step_sm
 from cachesim.timing.state import State
 from cachesim.timing.view import opener, prefetch, table_of
@@ -102,22 +102,19 @@ def _step_gl1s(state):  # type: ignore[no-untyped-def]
                 book(state.pool, S_REPLY, entered, now)
                 come_back(tags, state.pool, node, request)
                 home.wake = min(home.wake, now)
-        if home.wake > now:
-            continue
-        step_cache(tags, state.pool, node, now)
+        if home.wake <= now:
+            step_cache(tags, state.pool, node, now)
         for _ in range(width):
             if home.down_count > 0:
                 request = tags.queues[node, DOWN, home.down_head & room]
                 if inject(state, request, now + 1):
-                    home.down_head += 1
-                    home.down_count -= 1
+                    took_down(tags, node, now + 1)
         for _ in range(width):
             if home.out_count > 0:
                 request = tags.queues[node, OUT, home.out_head & room]
                 index = state.pool.requests[request].unit // machine.units
                 if state.sms[index].eject_count < machine.ejection:
-                    home.out_head += 1
-                    home.out_count -= 1
+                    took_out(tags, node, now + 1)
                     _give_to_sm(state, index, request)
                     machine.progress = now
 
@@ -139,8 +136,7 @@ def _send_replies(state):  # type: ignore[no-untyped-def]
             port = state.port_of[one.unit]
             if not has_room(machine, state.down, node, port):
                 break
-            home.out_head += 1
-            home.out_count -= 1
+            took_out(tags, node, machine.now)
             payload = 0 if one.write else 1 << machine.l2_sector_shift
             push(machine, state.down, node, port, request, payload, machine.now)
 
@@ -218,7 +214,7 @@ def _receive_requests(state, node):  # type: ignore[no-untyped-def]
                 drop_request(state.pool, request)
         else:
             arrive(tags, node, request, now + delay, now)
-        home.wake = min(home.wake, now)
+        home.wake = min(home.wake, home.delay_ready)
 
 
 @compiled
@@ -249,8 +245,7 @@ def _step_llc(state):  # type: ignore[no-untyped-def]
         target = llc.nodes[where]
         if target.delay_count + target.in_count + parts > llc.level[0].delay_capacity:
             continue
-        home.down_head += 1
-        home.down_count -= 1
+        took_down(l2, node, now)
         one = state.pool.requests[request]
         one.pending = parts
         for part in range(parts):
@@ -267,9 +262,8 @@ def _step_llc(state):  # type: ignore[no-untyped-def]
             drop_request(state.pool, request)
     for node in range(machine.num_llc):
         target = llc.nodes[node]
-        if target.wake > now:
-            continue
-        step_cache(llc, state.pool, node, now)
+        if target.wake <= now:
+            step_cache(llc, state.pool, node, now)
         for _ in range(llc.level[0].width):
             if target.out_count == 0:
                 break
@@ -277,8 +271,7 @@ def _step_llc(state):  # type: ignore[no-untyped-def]
             home = l2.nodes[state.pool.requests[request].slice]
             if home.fill_count >= l2.level[0].queue_fill:
                 break
-            target.out_head += 1
-            target.out_count -= 1
+            took_out(llc, node, now + 1)
             whole = _join(state, llc, request)
             if whole >= 0:
                 where, number = locate(state.l2_route, state.pool.requests[whole].address)
@@ -322,8 +315,12 @@ def _next_cycle(state):  # type: ignore[no-untyped-def]
         if state.l2.nodes[node].out_count + state.l2.nodes[node].down_count > 0:
             return now + 1
     for node in range(machine.num_gl1):
+        if state.gl1.nodes[node].out_count + state.gl1.nodes[node].down_count > 0:
+            return now + 1
         soonest = min(soonest, state.gl1.nodes[node].wake)
     for node in range(machine.num_llc):
+        if state.llc.nodes[node].out_count > 0:
+            return now + 1
         soonest = min(soonest, state.llc.nodes[node].wake)
     tags = state.llc if machine.has_llc else state.l2
     for index in range(machine.num_channels):
@@ -371,7 +368,11 @@ def _run(address, pause):  # type: ignore[no-untyped-def]
             index = k + start
             if index >= machine.num_sms:
                 index -= machine.num_sms
-            if state.sms[index].wake <= now:
+            sm = state.sms[index]
+            if sm.wake <= now or (
+                sm.waits_for_room
+                and has_room(machine, state.up, state.port_of[index * machine.units], 0)
+            ):
                 step_sm(state, index)
         if machine.taken < machine.queued and now >= machine.place_from:
             place_ctas(state)

@@ -195,6 +195,16 @@ def _may_succeed(state, pipe, node, bank):  # type: ignore[no-untyped-def]
     return node.mshr_used < level.num_mshrs or pipe.bank_taken[bank] != node.num_taken
 
 
+@small
+def _note_fail(pipe, bank):  # type: ignore[no-untyped-def]
+    """The look-up of a bank has failed."""
+    pipe.blocked = R_L1_RESERVATION
+    if pipe.bank_write[bank]:
+        pipe.write_fails += 1
+    else:
+        pipe.read_fails += 1
+
+
 @compiled
 def _look_up(state, unit):  # type: ignore[no-untyped-def]
     """Tag look-ups of the accesses whose delay is over, one per bank."""
@@ -208,10 +218,11 @@ def _look_up(state, unit):  # type: ignore[no-untyped-def]
         if pipe.bank_count[bank] == 0:
             continue
         if pipe.bank_ready[bank] > now:
+            pipe.until = min(pipe.until, pipe.bank_ready[bank])
             continue
         if pipe.bank_failed[bank] >= 0 and not _may_succeed(state, pipe, node, bank):
             state.l1.outcomes[pipe.bank_write[bank], FAIL] += 1
-            pipe.blocked = R_L1_RESERVATION
+            _note_fail(pipe, bank)
             continue
         at = unit * machine.num_banks + bank
         request = state.banks[at, pipe.bank_head[bank] & room].request
@@ -223,8 +234,9 @@ def _look_up(state, unit):  # type: ignore[no-untyped-def]
             pipe.bank_filled[bank] = node.num_filled
             pipe.bank_taken[bank] = node.num_taken
             pipe.bank_write[bank] = one.write
-            pipe.blocked = R_L1_RESERVATION
+            _note_fail(pipe, bank)
             continue
+        pipe.has_moved = 1
         pipe.bank_failed[bank] = -1
         pipe.bank_head[bank] = (pipe.bank_head[bank] + 1) & room
         pipe.bank_count[bank] -= 1
@@ -353,6 +365,7 @@ def _issue_accesses(state, unit):  # type: ignore[no-untyped-def]
                 bank = k
             if pipe.bank_count[bank] >= machine.l1_latency or pipe.bank_entered[bank] == now:
                 machine.bank_conflicts += 1
+                pipe.clashes = 1
                 return _out_of_bandwidth(pipe)
             index = _new_request(state, unit, address, at, sector)
             place = (pipe.bank_head[bank] + pipe.bank_count[bank]) & room
@@ -390,7 +403,9 @@ def _law_cycles(state, row, instruction):  # type: ignore[no-untyped-def]
 
 @compiled
 def _take_instruction(state, index, unit):  # type: ignore[no-untyped-def]
-    """Take the memory instruction that issued first among the schedulers' queue heads."""
+    """Take the memory instruction that issued first among the schedulers' queue heads. Returns
+    whether there was one.
+    """
     machine = state.pool.machine[0]
     sm = state.sms[index]
     pipe = state.pipes[unit]
@@ -398,7 +413,8 @@ def _take_instruction(state, index, unit):  # type: ignore[no-untyped-def]
     if pipe.free_at > now:
         if pipe.blocked == 0:
             pipe.blocked = R_L1_BANDWIDTH
-        return
+        pipe.until = min(pipe.until, pipe.free_at)
+        return False
     # With collectors this is the order of issue, and what is there may be taken.
     best, oldest = -1, NEVER if machine.collector_units > 0 else now + 1
     for s in range(machine.num_schedulers):
@@ -413,8 +429,10 @@ def _take_instruction(state, index, unit):  # type: ignore[no-untyped-def]
         time = sm.queue_time[at, s]
         if time < oldest:
             best, oldest = s, time
+        elif best < 0:
+            pipe.until = min(pipe.until, time)
     if best < 0:
-        return
+        return False
     at = sm.queue_head[best]
     slot = sm.queue_warp[at, best]
     sm.queue_head[best] = at + 1 if at + 1 < machine.memory_queue else 0
@@ -442,6 +460,16 @@ def _take_instruction(state, index, unit):  # type: ignore[no-untyped-def]
         # A fully masked access asks for nothing; `issue` left one sector pending for it.
         sector_back(state, pipe.warp, pipe.load)
         pipe.warp = -1
+    return True
+
+
+@small
+def book_sleep(state, unit, cycles):  # type: ignore[no-untyped-def]
+    """Count what failed again in cycles that the pipe slept through."""
+    pipe = state.pipes[unit]
+    state.l1.outcomes[0, FAIL] += cycles * pipe.read_fails
+    state.l1.outcomes[1, FAIL] += cycles * pipe.write_fails
+    state.pool.machine[0].bank_conflicts += cycles * pipe.clashes
 
 
 @compiled
@@ -450,23 +478,39 @@ def step_pipe(state, index, unit):  # type: ignore[no-untyped-def]
     machine = state.pool.machine[0]
     pipe = state.pipes[unit]
     pipe.blocked = 0
+    pipe.until = NEVER
+    pipe.read_fails = 0
+    pipe.write_fails = 0
+    pipe.clashes = 0
+    pipe.has_moved = pipe.next_writeback >= 0
     # A sector is chosen one cycle and written the next, so that a lone one takes two.
     for _ in range(machine.returns_per_cycle if pipe.next_writeback >= 0 else 1):
         if not _write_back(state, unit):
             break
+        pipe.has_moved = 1
     for _ in range(machine.sectors_per_cycle):
         if not _respond(state, unit):
             break
+        pipe.has_moved = 1
     if machine.has_fifo_l1:
         if pipe.request_count > 0 and send_up(state, fifo.oldest_request(state, unit)):
             fifo.request_sent(state, unit)
         fifo.step(state, unit)
+        if pipe.fragment_count + pipe.request_count + pipe.result_count > 0:
+            pipe.has_moved = 1
     for _ in range(machine.sectors_per_cycle):
         if not _drain_misses(state, unit):
             break
+        pipe.has_moved = 1
     if pipe.in_banks > 0:
         _look_up(state, unit)
-    if pipe.warp >= 0 and _issue_accesses(state, unit):
-        pipe.warp = -1
-    if pipe.warp < 0:
-        _take_instruction(state, index, unit)
+    if pipe.warp >= 0:
+        at, mask, left = pipe.at, pipe.mask, pipe.left
+        if _issue_accesses(state, unit):
+            pipe.warp = -1
+        if pipe.warp < 0 or pipe.at != at or pipe.mask != mask or pipe.left != left:
+            pipe.has_moved = 1
+    if pipe.warp < 0 and _take_instruction(state, index, unit):
+        pipe.has_moved = 1
+    if pipe.response_count > 0:
+        pipe.until = machine.now + 1

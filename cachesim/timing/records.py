@@ -146,6 +146,8 @@ NODE = np.dtype(
         ("version", "i8"),  # counts what may turn a reservation fail into success
         ("failed", "i8"),  # version at which the head of the queue failed, or -1
         ("failed_write", "i8"),  # whether it is a store
+        ("is_stalled", "i8"),  # whether the last step's look-up failed: so does each until the next
+        ("last_step", "i8"),
         ("fail_reason", "i8"),  # of the last look-up that failed
         ("num_filled", "i8"),  # counts what may turn a miss into a hit
         ("num_taken", "i8"),  # MSHRs taken so far
@@ -199,6 +201,7 @@ SM = np.dtype(
         # Until then, and until something new comes or room is made, stepping the collectors
         # changes nothing.
         ("collect_from", "i8"),
+        ("waits_for_room", "i4"),  # whether it sleeps until its port has room
         ("is_stuck", "i4"),  # whether nothing can issue until something changes
         ("num_collecting", "i4"),
         ("eject_head", "i4"),
@@ -267,6 +270,12 @@ PIPE = np.dtype(
         ("bank_taken", "i8", (MAX_BANKS,)),
         ("in_banks", "i8"),
         ("blocked", "i4"),  # 0, or why nothing left the pipe this cycle
+        # Of the last step; if it changed nothing, each cycle until the next has the same fails.
+        ("has_moved", "i4"),
+        ("until", "i8"),  # when it may move without news from outside
+        ("read_fails", "i4"),
+        ("write_fails", "i4"),
+        ("clashes", "i4"),
         # The texture FIFOs.
         ("rob_count", "i4"),
         ("fragment_count", "i4"),

@@ -126,6 +126,7 @@ def _look_up(tags, pool, node, now):  # type: ignore[no-untyped-def]
         return False
     if home.failed == home.version:
         tags.outcomes[home.failed_write, FAIL] += 1
+        home.is_stalled = 1
         return False
     request = _front(tags, node, IN, home.in_head)
     one = pool.requests[request]
@@ -141,6 +142,7 @@ def _look_up(tags, pool, node, now):  # type: ignore[no-untyped-def]
         if outcome == FAIL:
             home.failed = home.version
             home.failed_write = one.write
+            home.is_stalled = 1
             return False
         if outcome == HIT or one.operation == STORE:
             home.port_time = max(home.port_time, (now - 1) * 256 + 1) + level.port_cost
@@ -210,35 +212,67 @@ def come_back(tags, pool, node, request):  # type: ignore[no-untyped-def]
 @compiled
 def step_cache(tags, pool, node, now):  # type: ignore[no-untyped-def]
     """One cycle of one instance, its end first; sets the cycle in which it wants to be stepped
-    again, arrivals apart.
+    again, arrivals and room in the queues it fills apart.
     """
+    home = tags.nodes[node]
     width = tags.level[0].width
+    if home.is_stalled:
+        # It slept through cycles in which its look-up would have failed again.
+        tags.outcomes[home.failed_write, FAIL] += now - home.last_step - 1
+        home.is_stalled = 0
+    home.last_step = now
+    has_moved = False
     for _ in range(width):
         if not _take_ready(tags, pool, node, now):
             break
+        has_moved = True
     for _ in range(width):
         if not _take_fill(tags, pool, node, now):
             break
+        has_moved = True
     for _ in range(width):
         if not _drain_miss(tags, node):
             break
+        has_moved = True
     for _ in range(width):
         if not _look_up(tags, pool, node, now):
             break
+        has_moved = True
     for _ in range(width):
         if not _leave_delay(tags, pool, node, now):
             break
+        has_moved = True
+    home.wake = NEVER
+    if has_moved:
+        if home.in_count > 0 or home.fill_count > 0 or home.miss_count > 0 or home.ready_first >= 0:
+            home.wake = now + 1
+        elif home.delay_count > 0:
+            home.wake = max(now + 1, home.delay_ready)
+        return
+    # Nothing can move until a port is free, a delay is over, or somebody else wakes it.
+    if home.in_count > 0 and home.port_time > now * 256:
+        home.wake = (home.port_time + 255) // 256
+    if home.fill_count > 0 and home.fill_time > now * 256:
+        home.wake = min(home.wake, (home.fill_time + 255) // 256)
+    if home.delay_count > 0 and home.in_count < tags.level[0].queue_in:
+        home.wake = min(home.wake, max(now + 1, home.delay_ready))
+
+
+@small
+def took_down(tags, node, cycle):  # type: ignore[no-untyped-def]
+    """A miss has left the instance; if that was full, it is stepped in `cycle`."""
     home = tags.nodes[node]
-    if (
-        home.in_count > 0
-        or home.out_count > 0
-        or home.fill_count > 0
-        or home.miss_count > 0
-        or home.down_count > 0
-        or home.ready_first >= 0
-    ):
-        home.wake = now + 1
-    elif home.delay_count > 0:
-        home.wake = max(now + 1, home.delay_ready)
-    else:
-        home.wake = NEVER
+    if home.down_count >= tags.level[0].queue_down:
+        home.wake = min(home.wake, cycle)
+    home.down_head += 1
+    home.down_count -= 1
+
+
+@small
+def took_out(tags, node, cycle):  # type: ignore[no-untyped-def]
+    """A reply has left the instance; if that was full, it is stepped in `cycle`."""
+    home = tags.nodes[node]
+    if home.out_count >= tags.level[0].queue_out:
+        home.wake = min(home.wake, cycle)
+    home.out_head += 1
+    home.out_count -= 1

@@ -7,7 +7,7 @@ import numpy as np
 from cachesim.compiled import compiled, small
 from cachesim.stream import STORE
 from cachesim.timing.bits import bit_at, lowest, without_lowest
-from cachesim.timing.pipe import step_pipe
+from cachesim.timing.pipe import book_sleep, step_pipe
 from cachesim.timing.records import (
     CONTROL,
     FP32,
@@ -19,6 +19,7 @@ from cachesim.timing.records import (
     PATH_BYPASS,
     R_ARITHMETIC,
     R_IDLE,
+    R_INTERCONNECT,
     R_ISSUE,
     R_L1_BANDWIDTH,
     R_MEMORY,
@@ -323,6 +324,18 @@ def _issue(state, index, scheduler):  # type: ignore[no-untyped-def]
     return issued
 
 
+@small
+def _next_timed(sm, now, soonest):  # type: ignore[no-untyped-def]
+    """The next cycle in which a warp on the wheel wakes, or `soonest` if that comes first."""
+    if sm.num_timed > 0:
+        for ahead in range(1, WHEEL):
+            if now + ahead >= soonest:
+                break
+            if sm.wheel[(now + ahead) & (WHEEL - 1)] != 0:
+                return now + ahead
+    return soonest
+
+
 @compiled
 def _next_event(state, index):  # type: ignore[no-untyped-def]
     """The next cycle in which the SM has something to do, replies from outside apart."""
@@ -360,14 +373,7 @@ def _next_event(state, index):  # type: ignore[no-untyped-def]
             for bank in range(machine.num_banks):
                 if pipe.bank_count[bank] > 0:
                     soonest = min(soonest, max(now + 1, pipe.bank_ready[bank]))
-    if sm.num_timed > 0:
-        for ahead in range(1, WHEEL):
-            if now + ahead >= soonest:
-                break
-            if sm.wheel[(now + ahead) & (WHEEL - 1)] != 0:
-                soonest = now + ahead
-                break
-    return soonest
+    return _next_timed(sm, now, soonest)
 
 
 @compiled
@@ -377,16 +383,23 @@ def step_sm(state, index):  # type: ignore[no-untyped-def]
     sm = state.sms[index]
     now = machine.now
     # The cycles it slept through went where its last one did.
-    state.reasons[sm.last_reason] += now - sm.last_step - 1
+    slept = now - sm.last_step - 1
+    state.reasons[sm.last_reason] += slept
     sm.last_step = now
     blocked = 0
+    has_moved = False
     for unit in range(index * machine.units, (index + 1) * machine.units):
+        if slept > 0:
+            book_sleep(state, unit, slept)
         step_pipe(state, index, unit)
         blocked = max(blocked, state.pipes[unit].blocked)
+        has_moved |= state.pipes[unit].has_moved != 0
     if sm.num_timed > 0:
+        has_moved |= sm.wheel[now & (WHEEL - 1)] != 0
         wake_timed(state, index)
     if sm.num_collecting > 0 and sm.collect_from <= now:
         _collect(state, index)
+        has_moved |= sm.collect_from <= now + 1
     issued = 0
     if sm.num_resident > 0 and not sm.is_stuck:
         ready = sm.ready[0] | sm.ready[1] | sm.ready[2] | sm.ready[3] | sm.ready[4]
@@ -418,6 +431,30 @@ def step_sm(state, index):  # type: ignore[no-untyped-def]
     state.reasons[reason] += 1
     sm.last_reason = reason if reason != R_ISSUE else R_ARITHMETIC
     sm.wake = _next_event(state, index)
+    sm.waits_for_room = 0
+    if sm.wake == now + 1 and issued == 0 and not has_moved:
+        _sleep(state, index)
+
+
+@compiled
+def _sleep(state, index):  # type: ignore[no-untyped-def]
+    """After a cycle that changed nothing: set the one in which that may change by itself."""
+    machine = state.pool.machine[0]
+    sm = state.sms[index]
+    now = machine.now
+    if sm.num_resident > 0 and not sm.is_stuck:
+        return
+    soonest = NEVER
+    if sm.num_collecting > 0:
+        soonest = sm.collect_from
+    for unit in range(index * machine.units, (index + 1) * machine.units):
+        pipe = state.pipes[unit]
+        soonest = min(soonest, pipe.until)
+        if pipe.blocked == R_INTERCONNECT or state.l1.nodes[unit].miss_count > 0:
+            if machine.output_queued or machine.has_gl1:
+                return
+            sm.waits_for_room = 1
+    sm.wake = max(now + 1, _next_timed(sm, now, soonest))
 
 
 @compiled
