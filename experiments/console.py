@@ -70,6 +70,10 @@ class Progress:
         """Say how much of the total is done by now."""
         self._bar.update(self._task, completed=done)
 
+    def remark(self, text: str) -> None:
+        """One remark to the person, above the bar."""
+        self._bar.console.print(text, markup=False)
+
     def close(self) -> None:
         self._timer.cancel()
         self._timer.join()

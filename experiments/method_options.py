@@ -1,4 +1,6 @@
-"""The rendering method's options on the command line: one per field of `kernels.method.Method`."""
+"""The rendering method's options on the command line: one per field of `kernels.method.Method`
+but the profile.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from experiments.options import parse_names
+from traces.errors import InputError
 
 if TYPE_CHECKING:
     from kernels.method import Method
@@ -125,10 +128,44 @@ RadiusThreshold = Annotated[
     float,
     typer.Option("--radius-threshold", help="Mean radius, pixels, above which a tile is sampled."),
 ]
+ImportanceThreshold = Annotated[
+    float,
+    typer.Option("--importance-threshold", help="Painted importance from which a tile is sampled."),
+]
+Passthrough = Annotated[
+    float,
+    typer.Option("--passthrough", help="Mean radius, pixels, below which a tile keeps its light."),
+]
+Overlay = Annotated[
+    bool,
+    typer.Option(
+        "--overlay/--no-overlay",
+        help="Draw the scene's transparent layer over the picture; where it has none, a moving "
+        "veil.",
+    ),
+]
+Taa = Annotated[
+    bool, typer.Option("--taa/--no-taa", help="Accumulate the finished picture over the frames.")
+]
+TaaWeight = Annotated[
+    float,
+    typer.Option("--taa-weight", help="Weight of the newest frame in it at rest, 0.001 to 1."),
+]
+Lds = Annotated[
+    bool,
+    typer.Option("--lds/--no-lds", help="Serve near samples from a 10x10 patch in local memory."),
+]
 Planes = Annotated[
     str, typer.Option("--planes", metavar="LIST", help="Planes of the sampling pass to record.")
 ]
-Passes = Annotated[str, typer.Option("--passes", metavar="LIST", help="Passes to record.")]
+Passes = Annotated[
+    str | None,
+    typer.Option(
+        "--passes",
+        metavar="LIST",
+        help="Passes to record, of those that the method runs; all of them unless given.",
+    ),
+]
 TileOrder = Annotated[
     str, typer.Option("--tile-order", metavar="raster|morton", help="Order of the 8x8 tiles.")
 ]
@@ -138,21 +175,28 @@ LaneMap = Annotated[
 ]
 
 ALL_PLANES = "colour,normal,profile_id"
-ALL_PASSES = (
-    "setup,prefilter,classify,pilot,sampling,separable_h,separable_v,update,combine,overlay,taa"
-)
 
 
 def make_method(fields: dict[str, Any]) -> Method:
-    """A `Method` of a command's arguments; tuples of names come as comma-separated text.
+    """A `Method` of a command's arguments; tuples of names come as comma-separated text. Without
+    `passes`, a recording holds every pass that the method runs.
 
     Raises:
-        InputError: a field has a value that is not allowed.
+        InputError: a field has a value that is not allowed, or a pass that the method does not run.
     """
     from kernels.method import Method
+    from kernels.passes import names_run
 
+    fields = {name: value for name, value in fields.items() if value is not None}
     for name in ("planes", "passes", "hybrid_rules"):
         if name in fields:
             option = "--" + name.replace("_", "-")
             fields = {**fields, name: tuple(parse_names(fields[name], option))}
-    return Method(**fields)
+    method = Method(**fields)
+    for name in fields.get("passes", ()):
+        if name not in names_run(method):
+            raise InputError(
+                f"--passes: {name!r}: this method does not run it; it runs "
+                f"{', '.join(names_run(method))}"
+            )
+    return method

@@ -42,7 +42,8 @@ SceneName = Annotated[
     typer.Option(
         "--scene",
         metavar="NAME|FILE",
-        help="close, ear, front, side; a mesh (.glb .gltf .obj .ply); a G-buffer (.npz .exr).",
+        help="close, ear, front, side; circle, which moves; wall; a mesh (.glb .gltf .obj .ply); a "
+        "G-buffer (.npz .exr).",
     ),
 ]
 CameraName = Annotated[

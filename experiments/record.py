@@ -63,13 +63,19 @@ def command(
     hybrid_rules: options.HybridRules = "count,radius",
     count_threshold: options.CountThreshold = 16.0,
     radius_threshold: options.RadiusThreshold = 64.0,
+    importance_threshold: options.ImportanceThreshold = 0.5,
+    passthrough: options.Passthrough = 1.0,
+    overlay: options.Overlay = False,
+    taa: options.Taa = False,
+    taa_weight: options.TaaWeight = 0.04,
+    lds: options.Lds = False,
     hash_constants: options.Hash = "jcgt",
     prefilter: options.Prefilter = True,
     centre: options.Centre = True,
     bilateral: options.Bilateral = True,
     normal_weights: options.NormalWeights = True,
     planes: options.Planes = options.ALL_PLANES,
-    passes: options.Passes = options.ALL_PASSES,
+    passes: options.Passes = None,
     tile_order: options.TileOrder = "raster",
     lane_map: options.LaneMap = "linear",
 ) -> None:
@@ -109,6 +115,12 @@ def command(
             "hybrid_rules": hybrid_rules,
             "count_threshold": count_threshold,
             "radius_threshold_px": radius_threshold,
+            "importance_threshold": importance_threshold,
+            "passthrough_px": passthrough,
+            "overlay": overlay,
+            "taa": taa,
+            "taa_weight": taa_weight,
+            "lds": lds,
             "hash": hash_constants,
             "prefilter": prefilter,
             "centre_reweighting": centre,
@@ -121,13 +133,15 @@ def command(
         }
     )
     from kernels.device import open_device
+    from kernels.frame import gbuffer_of
     from kernels.record import estimate_rows
     from kernels.record import record as record_trace
-    from kernels.scene import load_scene
+    from kernels.scene import open_scene
     from traces.parquet import write_parquet
 
     opened = open_device(device)
-    gbuffer = load_scene(scene, width, height, device=opened, **mesh)
+    view = open_scene(scene, width, height, overlay=overlay, device=opened, **mesh)
+    gbuffer = gbuffer_of(view, 0)
     num_traced = {"last": 1, "all": frames}.get(traced, len(traced_frames))
     num_lanes = estimate_rows(gbuffer, chosen, num_traced) * 32
     low, high = (num_lanes * b / 1e6 for b in FILE_BYTES_PER_LANE)
@@ -137,7 +151,7 @@ def command(
         f"about {low:,.1f} to {high:,.1f} MB"
     )
     trace = record_trace(
-        gbuffer, chosen, num_frames=frames, traced_frames=traced_frames, device=opened
+        view, chosen, num_frames=frames, traced_frames=traced_frames, device=opened
     )
     num_fetches = 0
 

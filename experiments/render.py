@@ -50,6 +50,11 @@ def command(
     hybrid_rules: options.HybridRules = "count,radius",
     count_threshold: options.CountThreshold = 16.0,
     radius_threshold: options.RadiusThreshold = 64.0,
+    importance_threshold: options.ImportanceThreshold = 0.5,
+    passthrough: options.Passthrough = 1.0,
+    overlay: options.Overlay = False,
+    taa: options.Taa = False,
+    taa_weight: options.TaaWeight = 0.04,
 ) -> None:
     """Render a scene: without scattering, with it, and the map of sample counts."""
     from experiments.console import progress, remark
@@ -82,24 +87,31 @@ def command(
             "hybrid_rules": hybrid_rules,
             "count_threshold": count_threshold,
             "radius_threshold_px": radius_threshold,
+            "importance_threshold": importance_threshold,
+            "passthrough_px": passthrough,
+            "overlay": overlay,
+            "taa": taa,
+            "taa_weight": taa_weight,
         }
     )
     folder = output_folder(output)
     from experiments.plots import count_map
     from kernels.device import open_device
+    from kernels.frame import gbuffer_of
     from kernels.frame import render as render_frames
     from kernels.picture import preview, save_png, tone_map
-    from kernels.scene import load_scene
+    from kernels.scene import open_scene
 
     opened = open_device(device)
-    gbuffer = load_scene(scene, width, height, device=opened, **mesh)
+    view = open_scene(scene, width, height, overlay=overlay, device=opened, **mesh)
+    gbuffer = gbuffer_of(view, 0)
     with progress(f"rendering {gbuffer.name}", 1) as bar:
-        frame = render_frames(
-            gbuffer, chosen, num_frames=frames, device=opened, progress=bar.update
-        )
+        frame = render_frames(view, chosen, num_frames=frames, device=opened, progress=bar.update)
     stem = gbuffer.name.replace(":", "-")
+    gbuffer = gbuffer_of(view, frame.index)
+    shown = frame.combined if frame.shown is None else frame.shown
     save_png(folder / f"{stem}-preview.png", preview(gbuffer))
-    save_png(folder / f"{stem}-{method}.png", tone_map(frame.combined))
+    save_png(folder / f"{stem}-{method}.png", tone_map(shown))
     figure = count_map(frame.counts, f"{gbuffer.name}, frame {frame.index}", gbuffer.attribution)
     write_figure(folder / f"{stem}-{method}-counts.png", figure)
     if gbuffer.attribution:

@@ -94,6 +94,17 @@ class Circle:
         )
 
 
+def circle(width: int, height: int) -> Circle:
+    """The scene `circle`: the disc moves by an eightieth of the width per frame, at least a pixel,
+    and is smaller in pictures that are higher than wide.
+
+    Raises InputError: sizes that are not 1 to 16384.
+    """
+    check_size(width, height)
+    speed = min(max(1.0, width / 80), width / 2)
+    return Circle(width, height, speed, radius_rate=0.25 * min(1.0, width / height))
+
+
 def wall(
     width: int,
     height: int,

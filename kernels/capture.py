@@ -2,12 +2,13 @@
 
 `.npz` (no pickles): one array per field of GBuffer, under its name. irradiance, albedo,
 non_subsurface and normal (h, w, 3), depth_cm (h, w): any float type; profile_id (h, w): any integer
-type, 0 to 255; projection_x: a number. non_subsurface (black), importance (none), attribution and
-name (texts) may be left out.
+type, 0 to 255; projection_x: a number. These may be left out: non_subsurface (black), importance
+(h, w), velocity (h, w, 2) and overlay (h, w, 4) (none), jitter (two numbers, 0), attribution and
+name (texts).
 
 OpenEXR: the channels of CHANNELS, half or float, profile.ID half, float or uint. nonsss.* may be
-left out, and so may importance.Y. projection_x is the header's float attribute `projectionX`,
-attribution its text attribute `attribution`.
+left out, and so may those of PLANES. projection_x is the header's float attribute `projectionX`,
+jitter its pair of doubles `jitter`, attribution its text attribute `attribution`.
 """
 
 from __future__ import annotations
@@ -35,8 +36,12 @@ CHANNELS: dict[str, tuple[str, ...]] = {
     "profile_id": ("profile.ID",),
 }
 OPTIONAL = ("non_subsurface",)
-#: The channel of the field that is None where it is left out.
-IMPORTANCE = "importance.Y"
+#: The same of the fields that are None where they are left out.
+PLANES: dict[str, tuple[str, ...]] = {
+    "importance": ("importance.Y",),
+    "velocity": ("velocity.X", "velocity.Y"),
+    "overlay": ("overlay.R", "overlay.G", "overlay.B", "overlay.A"),
+}
 
 
 def load_npz(path: str | Path, projection_x: float | None = None) -> GBuffer:
@@ -63,20 +68,24 @@ def load_npz(path: str | Path, projection_x: float | None = None) -> GBuffer:
             f"{path}: projection_x: {stored.dtype} of shape {stored.shape}: need one number"
         )
     number = float(stored.reshape(())) if stored is not None else None
-    return _gbuffer(path, fields, number if projection_x is None else projection_x, **texts)
+    jitter = fields.pop("jitter", None)
+    projection_x = number if projection_x is None else projection_x
+    return _gbuffer(path, fields, projection_x, jitter, **texts)
 
 
 def save_npz(path: str | Path, gbuffer: GBuffer) -> None:
     """Write all of a G-buffer, compressed; whole or not at all. Raises InputError or WorkError."""
-    arrays: dict[str, Any] = {name: getattr(gbuffer, name) for name in CHANNELS}
+    arrays: dict[str, Any] = _planes(gbuffer)
     texts: dict[str, Any] = {
         "name": np.array(gbuffer.name),
         "attribution": np.array(gbuffer.attribution),
     }
-    if gbuffer.importance is not None:
-        arrays["importance"] = gbuffer.importance
+    numbers: dict[str, Any] = {
+        "projection_x": np.float64(gbuffer.projection_x),
+        "jitter": np.array(gbuffer.jitter, np.float64),
+    }
     with replacing(path) as part, writing(path), part.open("wb") as file:
-        np.savez_compressed(file, **arrays, **texts, projection_x=np.float64(gbuffer.projection_x))
+        np.savez_compressed(file, **arrays, **texts, **numbers)
 
 
 def load_exr(path: str | Path, projection_x: float | None = None) -> GBuffer:
@@ -96,9 +105,10 @@ def load_exr(path: str | Path, projection_x: float | None = None) -> GBuffer:
     except Exception as error:
         raise InputError(f"{path}: not a readable OpenEXR file: {_line(error)}") from None
     fields: dict[str, npt.NDArray[Any]] = {}
-    for field, names in CHANNELS.items():
+    for field, names in (CHANNELS | PLANES).items():
         missing = [name for name in names if name not in pixels]
-        if missing and not (field in OPTIONAL and len(missing) == len(names)):
+        may_miss = field in OPTIONAL or field in PLANES
+        if missing and not (may_miss and len(missing) == len(names)):
             held = ", ".join(sorted(pixels)) or "none"
             raise InputError(
                 f"{path}: channel {missing[0]} ({field}) is missing; the file holds {held}"
@@ -108,8 +118,6 @@ def load_exr(path: str | Path, projection_x: float | None = None) -> GBuffer:
             raise InputError(f"{path}: channels {', '.join(names)} have different sizes")
         if planes:
             fields[field] = np.stack(planes, axis=-1) if len(names) > 1 else planes[0]
-    if IMPORTANCE in pixels:
-        fields["importance"] = pixels[IMPORTANCE]
     ids = fields["profile_id"]
     if ids.dtype.kind == "f":
         if not (np.isfinite(ids).all() and (ids == np.rint(ids)).all() and np.abs(ids).max() < 1e9):
@@ -117,8 +125,9 @@ def load_exr(path: str | Path, projection_x: float | None = None) -> GBuffer:
         fields["profile_id"] = ids.astype(np.int64)
     number = header.get("projectionX")
     attribution = str(header.get("attribution", ""))
+    jitter = None if "jitter" not in header else np.asarray(header["jitter"])
     projection_x = number if projection_x is None else projection_x
-    return _gbuffer(path, fields, projection_x, attribution=attribution, name="")
+    return _gbuffer(path, fields, projection_x, jitter, attribution=attribution, name="")
 
 
 def save_exr(path: str | Path, gbuffer: GBuffer) -> None:
@@ -134,15 +143,14 @@ def save_exr(path: str | Path, gbuffer: GBuffer) -> None:
         "type": OpenEXR.scanlineimage,
         "projectionX": float(gbuffer.projection_x),
         "attribution": gbuffer.attribution,
+        "jitter": np.array(gbuffer.jitter, np.float64),
     }
     channels: dict[str, npt.NDArray[Any]] = {}
-    for field, names in CHANNELS.items():
-        planes = getattr(gbuffer, field).reshape(gbuffer.height, gbuffer.width, -1)
-        for index, name in enumerate(names):
+    for field, plane in _planes(gbuffer).items():
+        planes = plane.reshape(gbuffer.height, gbuffer.width, -1)
+        for index, name in enumerate((CHANNELS | PLANES)[field]):
             dtype = np.uint32 if field == "profile_id" else np.float32
             channels[name] = np.ascontiguousarray(planes[:, :, index], dtype=dtype)
-    if gbuffer.importance is not None:
-        channels[IMPORTANCE] = np.ascontiguousarray(gbuffer.importance)
     with replacing(path) as part, writing(path):
         try:
             OpenEXR.File(header, channels).write(str(part))
@@ -150,10 +158,17 @@ def save_exr(path: str | Path, gbuffer: GBuffer) -> None:
             raise OSError(_line(error)) from None
 
 
+def _planes(gbuffer: GBuffer) -> dict[str, npt.NDArray[Any]]:
+    """The arrays that a G-buffer has, by field."""
+    planes = {name: getattr(gbuffer, name) for name in (*CHANNELS, *PLANES)}
+    return {name: plane for name, plane in planes.items() if plane is not None}
+
+
 def _gbuffer(
     path: Path,
     fields: dict[str, npt.NDArray[Any]],
     projection_x: float | None,
+    jitter: npt.NDArray[Any] | None,
     name: str,
     attribution: str,
 ) -> GBuffer:
@@ -177,9 +192,15 @@ def _gbuffer(
         ids.size and not 0 <= int(ids.min()) <= int(ids.max()) <= 255
     ):
         raise InputError(f"{path}: profile_id: {ids.dtype}: need whole numbers from 0 to 255")
+    if jitter is None:
+        jitter = np.zeros(2)
+    if jitter.shape != (2,) or jitter.dtype.kind not in "fiu":
+        raise InputError(
+            f"{path}: jitter: {jitter.dtype} of shape {jitter.shape}: need two numbers"
+        )
     planes: dict[str, Any] = {"profile_id": ids.astype(np.uint8)}
-    for field in (*CHANNELS, "importance"):
-        if field == "profile_id" or (field == "importance" and field not in fields):
+    for field in (*CHANNELS, *PLANES):
+        if field == "profile_id" or (field in PLANES and field not in fields):
             continue
         value = fields.get(field, np.zeros((*shape, 3), np.float32))
         if value.dtype.kind not in "fiu":
@@ -190,7 +211,11 @@ def _gbuffer(
     title = name or path.stem
     try:
         return GBuffer(
-            name=title, projection_x=float(projection_x), attribution=attribution, **planes
+            name=title,
+            projection_x=float(projection_x),
+            attribution=attribution,
+            jitter=(float(jitter[0]), float(jitter[1])),
+            **planes,
         )
     except InputError as error:
         raise InputError(f"{path}: {str(error).removeprefix(f'{title}: ')}") from None

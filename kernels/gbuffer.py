@@ -76,7 +76,7 @@ class GBuffer:
             self._check("importance", (height, width), np.float32)
             if not (0 <= self.importance.min() and self.importance.max() <= 1):
                 raise InputError(f"{self.name}: importance: allowed are 0 to 1")
-        if not max(map(abs, self.jitter)) <= 2:
+        if not all(abs(offset) <= 2 for offset in self.jitter):
             raise InputError(f"{self.name}: jitter {self.jitter}: allowed are -2 to 2 pixels")
         if not self.projection_x > 0:
             raise InputError(f"{self.name}: projection_x {self.projection_x}: must be positive")

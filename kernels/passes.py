@@ -40,7 +40,7 @@ class Pass(Protocol):
         """The kernel's arguments between the warp's and the trace's. level: as in `Step`."""
 
 
-#: The passes by name; `list_steps` says when each runs.
+#: The passes by name; `names_run` says which of them a method runs, and in what order.
 PASSES: dict[str, Pass] = {
     "setup": setup,
     "prefilter": prefilter,
@@ -113,26 +113,33 @@ def _behind_list(accesses: tuple[Access, ...]) -> tuple[Access, ...]:
     return (Access("tile_list"), first, *rest)
 
 
+def names_run(method: Method) -> tuple[str, ...]:
+    """The passes that a frame of the method runs, in order."""
+    runs = {
+        "setup": True,
+        "prefilter": method.prefilter and method.samples,
+        "classify": method.hybrid,
+        "pilot": method.takes_pilots,
+        "sampling": method.samples,
+        "separable_h": method.filters,
+        "separable_v": method.filters,
+        "update": method.updates_history,
+        "combine": True,
+        "overlay": method.overlay,
+        "taa": method.taa,
+    }
+    return tuple(name for name, does in runs.items() if does)
+
+
 def list_steps(method: Method, grid: Grid, num_levels: int) -> list[Step]:
     """Every launch of a frame, traced or not; grid: the full screen's."""
-    steps = [Step("setup", 0, grid)]
-    for level in range(num_levels - 1):
-        width, height = grid.width >> level + 1, grid.height >> level + 1
-        coarser = Grid(width, height, grid.tile_order, grid.lane_map)
-        steps.append(Step("prefilter", level, coarser))
-    if method.hybrid:
-        steps.append(Step("classify", 0, grid))
-    if method.takes_pilots:
-        steps.append(Step("pilot", 0, grid))
-    if method.samples:
-        steps.append(Step("sampling", 0, grid))
-    if method.filters:
-        steps += [Step("separable_h", 0, grid), Step("separable_v", 0, grid)]
-    if method.updates_history:
-        steps.append(Step("update", 0, grid))
-    steps.append(Step("combine", 0, grid))
-    if method.overlay:
-        steps.append(Step("overlay", 0, grid))
-    if method.taa:
-        steps.append(Step("taa", 0, grid))
+    steps = []
+    for name in names_run(method):
+        if name != "prefilter":
+            steps.append(Step(name, 0, grid))
+            continue
+        for level in range(num_levels - 1):
+            width, height = grid.width >> level + 1, grid.height >> level + 1
+            coarser = Grid(width, height, grid.tile_order, grid.lane_map)
+            steps.append(Step(name, level, coarser))
     return steps

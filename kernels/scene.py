@@ -6,6 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from kernels.analytic import circle, wall
 from kernels.camera import CAMERAS, Camera, camera_named, check_size
 from kernels.gbuffer import GBuffer
 from kernels.light import RIG, Rig
@@ -13,12 +14,40 @@ from traces.errors import InputError, unknown
 
 if TYPE_CHECKING:
     from kernels.device import Device
+    from kernels.frame import Scene
 
-SCENES: tuple[str, ...] = tuple(CAMERAS)
+CIRCLE, WALL = "circle", "wall"
+SCENES: tuple[str, ...] = (*CAMERAS, CIRCLE, WALL)
 MESHES = (".glb", ".gltf", ".obj", ".ply")
 CAPTURES = (".npz", ".exr")
 # The resolution of the study.
 WIDTH, HEIGHT = 1920, 1080
+
+
+def open_scene(
+    name_or_path: str | Path,
+    width: int | None = None,
+    height: int | None = None,
+    *,
+    overlay: bool = False,
+    **options: Any,
+) -> Scene:
+    """The scene as the frame loop takes it: what moves is a function from frame to G-buffer, the
+    rest one view. `circle` moves.
+
+    overlay: draw `motion.veil` over a scene that has nothing transparent of its own. The rest: as
+    `load_scene`, which see for the errors.
+    """
+    # Refuses what the scene does not take.
+    first = load_scene(name_or_path, width, height, **options)
+    scene: Scene = first
+    if str(name_or_path) == CIRCLE:
+        scene = circle(first.width, first.height)
+    if overlay and first.overlay is None:
+        from kernels.motion import Overlaid, veil
+
+        return Overlaid(scene, veil())
+    return scene
 
 
 def load_scene(
@@ -33,16 +62,17 @@ def load_scene(
     progress: Callable[[float], None] | None = None,
     **mesh_options: Any,
 ) -> GBuffer:
-    """Load or render one view.
+    """Load or render one view; the first where the scene moves.
 
-    name_or_path: close, ear, front or side, the procedural head's views; a mesh (.glb, .gltf, .obj,
-    .ply); or a captured G-buffer (.npz, .exr).
+    name_or_path: close, ear, front or side, the procedural head's views; circle, a disc that moves
+    before a background; wall, which recedes; a mesh (.glb, .gltf, .obj, .ply); or a captured
+    G-buffer (.npz, .exr).
     width, height: pixels, 1 to 16384; None is 1920x1080, or a capture's own size, from which it may
     not differ.
     camera: for a mesh, one of the four names (placed from its bounding box) or a Camera in cm; None
     is front. For the procedural head, a Camera instead of the named one.
     device: for the procedural head; None opens the default one.
-    rig: lights of what is rendered.
+    rig: lights of a head or a mesh; circle and wall have their own.
     projection_x: for a capture that does not state it, or states it wrongly.
     progress: called with the share done, in [0, 1].
     mesh_options: albedo_map, normal_map, flip_v, height_cm, up, forward: see mesh.load_mesh.
@@ -51,7 +81,7 @@ def load_scene(
     """
     name = str(name_or_path)
     suffix = Path(name).suffix.lower()
-    is_capture, is_mesh = suffix in CAPTURES, suffix in MESHES
+    is_capture, is_mesh, is_analytic = suffix in CAPTURES, suffix in MESHES, name in (CIRCLE, WALL)
     if name not in SCENES and not is_capture and not is_mesh:
         raise unknown(
             "scene", name, [*SCENES, *(f"a path ending in {s}" for s in MESHES + CAPTURES)]
@@ -64,6 +94,9 @@ def load_scene(
 
     width, height = WIDTH if width is None else width, HEIGHT if height is None else height
     check_size(width, height)
+    if is_analytic:
+        _refuse(name, {"camera": camera}, False, "the head or a mesh")
+        return circle(width, height)(0) if name == CIRCLE else wall(width, height)
     if is_mesh:
         from kernels.mesh_render import render_mesh
 

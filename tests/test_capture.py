@@ -6,7 +6,7 @@ import os
 import numpy as np
 import pytest
 
-from kernels.capture import CHANNELS, load_exr, load_npz, save_exr, save_npz
+from kernels.capture import CHANNELS, PLANES, load_exr, load_npz, save_exr, save_npz
 from kernels.gbuffer import GBuffer
 from kernels.scene import load_scene
 from traces.errors import InputError, WorkError
@@ -108,6 +108,37 @@ def test_other_float_and_integer_types_are_taken(tmp_path):
     assert np.array_equal(loaded.profile_id, gbuffer.profile_id)
 
 
+def moving(height=9, width=13):
+    rng = np.random.default_rng(11)
+    return dataclasses.replace(
+        sample(height, width),
+        velocity=rng.normal(size=(height, width, 2)).astype(np.float32),
+        overlay=rng.random((height, width, 4), dtype=np.float32),
+        importance=rng.random((height, width), dtype=np.float32),
+        jitter=(0.1, -1 / 3),
+    )
+
+
+@pytest.mark.parametrize("suffix", SAVE)
+def test_velocity_overlay_importance_and_jitter_come_back_bit_for_bit(tmp_path, suffix):
+    path, before = tmp_path / f"moving{suffix}", moving()
+    SAVE[suffix](path, before)
+    after = load_scene(path)
+    for name in (*CHANNELS, *PLANES):
+        assert np.array_equal(getattr(before, name), getattr(after, name)), name
+        assert getattr(before, name).dtype == getattr(after, name).dtype
+    assert after.jitter == before.jitter
+
+
+@pytest.mark.parametrize("suffix", SAVE)
+def test_files_without_motion_are_read_as_still(tmp_path, suffix):
+    path = tmp_path / f"old{suffix}"
+    (write_npz if suffix == ".npz" else write_exr)(path)
+    still = LOAD[suffix](path)
+    assert still.velocity is None and still.overlay is None and still.importance is None
+    assert still.jitter == (0.0, 0.0)
+
+
 NAN_DEPTH = np.full((9, 13), np.nan, np.float32)
 BAD_FIELDS = {
     "missing": ({"depth_cm": None}, "depth_cm is missing; the file holds albedo"),
@@ -125,6 +156,12 @@ BAD_FIELDS = {
     "pickled": ({"albedo": np.array([{}, 1], dtype=object)}, "albedo: a pickled array"),
     "projection": ({"projection_x": np.zeros(2)}, "projection_x: float64 of shape"),
     "no projection": ({"projection_x": None}, "projection_x is missing"),
+    "velocity size": ({"velocity": np.zeros((9, 13, 3))}, "velocity: float32 of shape"),
+    "opacity": ({"overlay": np.full((9, 13, 4), 2.0)}, "overlay: opacity: allowed are 0 to 1"),
+    "jitter": ({"jitter": np.zeros(3)}, "jitter: float64 of shape (3,): need two numbers"),
+    "jitter text": ({"jitter": np.array(["a", "b"])}, "jitter: <U1 of shape (2,)"),
+    "jitter far": ({"jitter": np.array([3.0, 0.0])}, "jitter (3.0, 0.0): allowed are -2 to 2"),
+    "jitter NaN": ({"jitter": np.array([0.0, np.nan])}, "jitter (0.0, nan): allowed"),
     "projection zero": ({"projection_x": -1.0}, "projection_x -1.0: must be positive"),
 }
 
@@ -148,6 +185,8 @@ BAD_CHANNELS = {
     "profile part": ({"profile__ID": np.full((9, 13), 0.5, np.float32)}, "need whole numbers"),
     "profile NaN": ({"profile__ID": NAN_DEPTH}, "need whole numbers"),
     "no projection": ({"header": {}}, "projection_x is missing"),
+    "half a velocity": ({"velocity__X": np.zeros((9, 13), np.float32)}, "channel velocity.Y"),
+    "jitter": ({"header": {"projectionX": 3.75, "jitter": "0 0"}}, "jitter: <U3 of shape ()"),
 }
 
 

@@ -1,6 +1,7 @@
 """Which folder compiled loops are cached in."""
 
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -25,6 +26,17 @@ def test_any_change_of_any_source_changes_the_folder(tmp_path: Path) -> None:
     changed = source_hash(root)
     (root / "traces" / "a.py").rename(root / "traces" / "b.py")
     assert len({before, changed, source_hash(root)}) == 3
+
+
+def test_other_sources_do_not_change_the_folder_and_hold_no_compiled_loops(tmp_path: Path) -> None:
+    root = packages(tmp_path)
+    before = source_hash(root)
+    (root / "kernels" / "a.py").write_text("kernels = 2\n")
+    assert source_hash(root) == before
+    sources = [path for room in ("kernels", "experiments") for path in (ROOT / room).rglob("*.py")]
+    assert sources
+    for path in sources:
+        assert not re.search(r"\bn?jit\b|\bvectorize\b", path.read_text()), path
 
 
 def cache_folder(environment: dict[str, str]) -> str:

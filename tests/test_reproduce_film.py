@@ -190,6 +190,15 @@ def test_an_overlay_reaches_the_global_picture_and_no_local_pixel(first_device):
     assert (frames[2:, 3] >= frames[2:, 2]).all() and frames[-1, 3] > frames[-1, 2] + 1
 
 
+def test_the_overlays_plot_keeps_a_quantity_to_an_axis():
+    frames = np.array([[0.0, 0.02, 8.0, 12.0, 9.0], [3.0, 0.01, 8.0, 11.0, 9.0]])
+    panels = adaptive_o1_results.overlay_figure({"frames": frames}).axes
+    drawn = {axes.get_ylabel(): [line.get_ydata() for line in axes.lines] for axes in panels}
+    assert np.array_equal(drawn["rms difference, last 8 frames"], [[0.02, 0.01]])
+    assert np.array_equal(drawn["pixels that differ"], [[0, 3]])
+    assert np.array_equal(drawn["samples"], [[8, 8], [12, 11], [9, 9]])
+
+
 # disocclusion
 
 

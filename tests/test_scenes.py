@@ -7,13 +7,14 @@ import numpy as np
 import pytest
 
 from kernels import head
+from kernels.analytic import Circle, wall
 from kernels.camera import CAMERAS, Camera
 from kernels.device import open_device
 from kernels.frame import advance, start_pipeline
 from kernels.light import RIG, Light, Rig
 from kernels.method import Method
 from kernels.picture import preview, save_png, tone_map
-from kernels.scene import SCENES, load_scene
+from kernels.scene import load_scene, open_scene
 from traces.errors import InputError
 
 PLANES = ("irradiance", "albedo", "non_subsurface", "depth_cm", "normal", "profile_id")
@@ -23,7 +24,7 @@ STUDY = (480, 270)
 @pytest.fixture(scope="module")
 def views():
     """The four views at a quarter of the study's resolution, by name."""
-    return {name: load_scene(name, *STUDY) for name in SCENES}
+    return {name: load_scene(name, *STUDY) for name in CAMERAS}
 
 
 def digest(gbuffer):
@@ -71,6 +72,24 @@ def test_a_camera_that_cannot_see_is_refused(change):
         dataclasses.replace(CAMERAS["front"], **change)
 
 
+def test_circle_and_wall_are_scenes_by_name():
+    moving = open_scene("circle", 160, 90)
+    assert isinstance(moving, Circle)
+    assert np.array_equal(moving(5).depth_cm, Circle(160, 90, speed_pixels=2.0)(5).depth_cm)
+    assert np.array_equal(load_scene("circle", 160, 90).depth_cm, moving(0).depth_cm)
+    for scene in (open_scene("wall", 64, 36), load_scene("wall", 64, 36)):
+        assert np.array_equal(scene.depth_cm, wall(64, 36).depth_cm)
+    # A disc of a quarter of the height would not fit.
+    assert load_scene("circle", 8, 64).subsurface.all()
+    for name in ("circle", "wall"):
+        with pytest.raises(InputError, match=f"{name}: camera: only the head or a mesh"):
+            load_scene(name, 64, 36, camera="ear")
+        with pytest.raises(InputError, match="from 1 to 16384"):
+            load_scene(name, 0, 36)
+    with pytest.raises(InputError, match="did you mean 'circle'"):
+        load_scene("circl", 64, 36)
+
+
 def test_camera_axes_are_orthonormal_and_right_handed():
     for camera in CAMERAS.values():
         axes = np.stack(camera.basis())
@@ -95,7 +114,7 @@ def test_a_light_that_cannot_be_is_refused(change):
 
 
 @pytest.mark.opencl
-@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize("name", CAMERAS)
 def test_each_view_has_its_stated_coverage_and_scale(views, name):
     camera = CAMERAS[name]
     assert views[name].coverage_rate == pytest.approx(camera.coverage_rate, abs=0.01)
@@ -225,7 +244,7 @@ def test_a_larger_light_casts_a_softer_shadow():
 
 def test_every_device_renders_the_same_bytes(device):
     first = head.open_device()
-    for name in SCENES:
+    for name in CAMERAS:
         here = head.render_head(CAMERAS[name], 97, 61, device)
         there = head.render_head(CAMERAS[name], 97, 61, first)
         assert digest(here) == digest(there), f"{device.name} against {first.name}: {name}"

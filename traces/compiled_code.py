@@ -13,7 +13,7 @@ from pathlib import Path
 
 _ROOT = Path(__file__).resolve().parent.parent
 #: The packages that hold compiled loops.
-_PACKAGES = ("traces", "cachesim", "kernels")
+_PACKAGES = ("traces", "cachesim")
 
 
 def source_hash(root: Path) -> str:

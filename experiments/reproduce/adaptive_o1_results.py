@@ -315,12 +315,15 @@ def overlay_figure(disturbed: Arrays) -> Figure:
     return line_figure(
         [
             Panel(
-                "What the veil leaves behind",
+                "What the TAA still shows of the veil",
                 "rms difference, last 8 frames",
-                {
-                    "accumulated by the TAA": of["difference in the trail"],
-                    "local pixels that differ": of["local pixels that differ"],
-                },
+                {"accumulated by the TAA": of["difference in the trail"]},
+            ),
+            Panel(
+                "What local guiding sees of the veil",
+                "pixels that differ",
+                {"local history or count": of["local pixels that differ"]},
+                limits=(-0.5, max(10.0, 1.05 * float(of["local pixels that differ"].max()))),
             ),
             Panel(
                 "Samples asked per pixel",
@@ -331,7 +334,8 @@ def overlay_figure(disturbed: Arrays) -> Figure:
                     "local guiding, veiled": of["local count"],
                 },
             ),
-        ]
+        ],
+        num_columns=3,
     )
 
 

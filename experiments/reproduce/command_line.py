@@ -10,7 +10,10 @@ import typer
 from experiments.options import DeviceName
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from experiments.reproduce.experiment import Experiment
+    from experiments.reproduce.jobs import Tell
 
 OUT = Path("out") / "reproduce"
 
@@ -23,6 +26,9 @@ def command(
     quick: Annotated[
         bool, typer.Option("--quick", help="Small sizes: seconds to a minute each.")
     ] = False,
+    jobs: Annotated[
+        int, typer.Option("--jobs", metavar="N", min=1, help="Experiments that run at once.")
+    ] = 1,
     device: DeviceName = None,
     output: Annotated[
         Path | None,
@@ -44,7 +50,7 @@ def command(
             raise InputError("list: stands alone; name experiments to run them")
         print_list(catalogue.all_experiments())
         return
-    run_experiments(chosen, quick, output or (OUT / "quick" if quick else OUT), device)
+    run_experiments(chosen, quick, output or (OUT / "quick" if quick else OUT), device, jobs)
 
 
 def print_list(experiments: tuple[Experiment, ...]) -> None:
@@ -75,9 +81,11 @@ def print_list(experiments: tuple[Experiment, ...]) -> None:
 
 
 def run_experiments(
-    experiments: tuple[Experiment, ...], quick: bool, out: Path, device: str | None
+    experiments: tuple[Experiment, ...], quick: bool, out: Path, device: str | None, jobs: int = 1
 ) -> None:
     """Run each, write its page and the index; what fails does not keep the others from running.
+
+    jobs: how many run at once, each in a process of its own, those that take longest first.
 
     Raises:
         WorkError: some of them failed; the index says which and why.
@@ -85,7 +93,7 @@ def run_experiments(
     from experiments.console import remark
     from experiments.output import output_folder
     from experiments.reproduce import catalogue, pages
-    from traces.errors import InputError, WorkError
+    from traces.errors import WorkError
 
     folder = output_folder(out)
     failures: dict[str, str] = {}
@@ -94,17 +102,29 @@ def run_experiments(
         if entry.run is None:
             remark(f"{entry.name}: not computed: {entry.reason}")
     minutes = sum(e.expected_minutes(quick) for e in running)
-    remark(f"{_count(len(running))}, {_minutes(minutes)} in all, into {folder}")
-    for number, entry in enumerate(running, start=1):
+    at_once = f", {jobs} at once" if jobs > 1 else ""
+    remark(f"{_count(len(running))}, {_minutes(minutes)} in all{at_once}, into {folder}")
+    together = [e for e in running if jobs > 1 and not e.after_others]
+    together.sort(key=lambda e: -e.expected_minutes(quick))
+    started = 0
+
+    def begin(entry: Experiment) -> str:
+        nonlocal started
+        started += 1
         expected = _minutes(entry.expected_minutes(quick))
-        remark(f"[{number}/{len(running)}] {entry.name}: {entry.title}; {expected}")
-        try:
-            remark(_run_one(entry, quick, folder, device))
-        except (InputError, WorkError) as error:
-            failures[entry.name] = " ".join(str(error).split())
-            remark(f"{entry.name}: failed: {failures[entry.name]}")
+        return f"[{started}/{len(running)}] {entry.name}: {entry.title}; {expected}"
+
+    def end(entry: Experiment, failure: str = "") -> None:
+        if failure:
+            failures[entry.name] = failure
         # After each, so that an interrupted run leaves an index over what is finished.
         pages.write_index(folder, catalogue.all_experiments(), failures)
+
+    _run_together(together, quick, folder, device, jobs, begin, end)
+    for entry in running:
+        if entry not in together:
+            remark(begin(entry))
+            end(entry, _run_alone(entry, quick, folder, device))
     index = pages.write_index(folder, catalogue.all_experiments(), failures)
     remark(f"wrote {index}")
     if failures:
@@ -112,23 +132,82 @@ def run_experiments(
         raise WorkError(f"{len(failures)} of {len(running)} experiments failed: {told}")
 
 
-def _run_one(entry: Experiment, quick: bool, folder: Path, device: str | None) -> str:
+def _run_together(
+    entries: list[Experiment],
+    quick: bool,
+    folder: Path,
+    device: str | None,
+    jobs: int,
+    begin: Callable[[Experiment], str],
+    end: Callable[[Experiment, str], None],
+) -> None:
+    """Run experiments in processes, with one bar over all of them."""
+    from functools import partial
+
+    from experiments.console import progress
+    from experiments.reproduce.jobs import DONE, FAILED, STARTED, run_in_processes
+
+    if not entries:
+        return
+    by_name = {e.name: e for e in entries}
+    minutes = {e.name: e.expected_minutes(quick) for e in entries}
+    shares: dict[str, float] = {}
+    going: dict[str, str] = {}
+    work = partial(run_named, quick=quick, folder=folder, device=device)
+    with progress("starting", sum(minutes.values())) as bar:
+        for event in run_in_processes(list(by_name), jobs, work):
+            entry = by_name[event.name]
+            shares[event.name] = event.share
+            going[event.name] = f"{event.name} {event.share:.0%}"
+            if event.kind == STARTED:
+                bar.remark(begin(entry))
+            elif event.kind in (DONE, FAILED):
+                failed = event.kind == FAILED
+                bar.remark(f"{entry.name}: failed: {event.text}" if failed else event.text)
+                del going[event.name]
+                end(entry, event.text if failed else "")
+            bar.describe(", ".join(going.values()))
+            bar.update(sum(minutes[name] * share for name, share in shares.items()))
+
+
+def run_named(name: str, tell: Tell, *, quick: bool, folder: Path, device: str | None) -> str:
+    """Run the experiment of a name and write its page; returns a line on what it found."""
+    from experiments.reproduce import catalogue
+
+    return _run_one(catalogue.select([name])[0], quick, folder, device, tell)
+
+
+def _run_alone(entry: Experiment, quick: bool, folder: Path, device: str | None) -> str:
+    """Run an experiment in this process, with a bar of its own; returns why it failed, or ""."""
+    from experiments.console import progress, remark
+    from traces.errors import InputError, WorkError
+
+    try:
+        with progress(entry.name, 1.0) as bar:
+
+            def tell(text: str, share: float) -> None:
+                bar.describe(f"{entry.name}: {text}")
+                bar.update(share)
+
+            line = _run_one(entry, quick, folder, device, tell)
+    except (InputError, WorkError) as error:
+        failure = " ".join(str(error).split())
+        remark(f"{entry.name}: failed: {failure}")
+        return failure
+    remark(line)
+    return ""
+
+
+def _run_one(entry: Experiment, quick: bool, folder: Path, device: str | None, tell: Tell) -> str:
     """Run an experiment and write its page; returns a line on what it found."""
     from time import monotonic
 
-    from experiments.console import progress
     from experiments.reproduce import pages
     from experiments.reproduce.experiment import Settings
 
     assert entry.run is not None
     start = monotonic()
-    with progress(entry.name, 1.0) as bar:
-
-        def tell(text: str, share: float) -> None:
-            bar.describe(f"{entry.name}: {text}")
-            bar.update(share)
-
-        outcome = entry.run(Settings(quick, folder, tell, device))
+    outcome = entry.run(Settings(quick, folder, tell, device))
     took = monotonic() - start
     page = pages.write_outcome(folder, entry, outcome, quick=quick, seconds=took)
     return f"{entry.name}: {outcome.summary()} ({page}, {took:,.0f} s)"

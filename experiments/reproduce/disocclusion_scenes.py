@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from kernels.analytic import Circle
+from kernels.analytic import Circle, circle
 
 if TYPE_CHECKING:
     from experiments.reproduce.film import Float
@@ -36,8 +36,8 @@ def stage(
         new = np.zeros((height, width), np.int64)
         return background(width, height), lambda frame: new + frame, lambda frame: still, ages
     if event == EVENTS[1]:
-        circle = Circle(width, height, speed_pixels=max(1.0, width / 80))
-        return circle, LaidOpen(circle), lambda frame: still, 2 * ages
+        moving = circle(width, height)
+        return moving, LaidOpen(moving), lambda frame: still, 2 * ages
 
     def rolled(frame: int) -> Float:
         return np.roll(scrolling, -frame * SCROLL, axis=1)

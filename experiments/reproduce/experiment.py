@@ -157,7 +157,8 @@ class Experiment:
     name: on the command line; its module is named alike. title: what it shows, one line. chapter,
     figure: where in the dissertation ("5", "slide: sampling function"). minutes, quick_minutes: how
     long a run takes on a laptop's four cores. run: None where the sources do not allow the result,
-    and `reason` then says why.
+    and `reason` then says why. after_others: whether it shows what the others have written, and so
+    has to wait for them.
     """
 
     name: str
@@ -168,6 +169,7 @@ class Experiment:
     quick_minutes: float = 0.0
     run: Callable[[Settings], Outcome] | None = None
     reason: str = ""
+    after_others: bool = False
 
     def __post_init__(self) -> None:
         if (self.run is None) != bool(self.reason):

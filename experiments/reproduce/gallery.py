@@ -228,4 +228,5 @@ EXPERIMENT = Experiment(
     minutes=2,
     quick_minutes=0.2,
     run=run,
+    after_others=True,
 )
