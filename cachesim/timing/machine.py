@@ -213,7 +213,7 @@ def _tags(
     mshrs = instances * timing.num_mshrs
     tags = Tags(
         rules,
-        np.zeros(instances, records.NODE),
+        records.zeros(instances, records.NODE),
         np.zeros(lines, records.LINE),
         np.zeros(lines * level.sectors_per_line, np.uint32),
         np.zeros(lines * level.sectors_per_line, np.int32),
@@ -400,18 +400,19 @@ def build(gpu: Gpu, fetch_path: str, num_groups: int) -> State:
     )
     pool_size = power_of_two(2 * int(machine[0]["num_pool"]) + _FIRST_POOL)
     machine[0]["free_top"] = pool_size
-    sms = np.zeros(num_sms, records.SM)
+    sms = records.zeros(num_sms, records.SM)
     sms["wake"] = NEVER
     sms["last_reason"] = records.R_IDLE
     sms["last_step"] = -1
     sms["last_issued"] = -1
     sms["issued_slot"] = -1
     sms["collector_slot"] = -1
-    pipes = np.zeros(num_sms * units, records.PIPE)
+    pipes = records.zeros(num_sms * units, records.PIPE)
     for field in ("warp", "next_writeback", "next_global"):
         pipes[field] = -1
-    pipes["bank_entered"] = -1
-    pipes["bank_failed"] = -1
+    l1_banks = records.zeros(num_sms * units * l1_timing.num_banks, records.L1_BANK)
+    l1_banks["entered"] = -1
+    l1_banks["failed"] = -1
     masks = np.zeros(sm.num_schedulers, np.uint64)
     for slot in range(MAX_WARPS):
         masks[slot % sm.num_schedulers] |= np.uint64(1 << slot)
@@ -433,7 +434,7 @@ def build(gpu: Gpu, fetch_path: str, num_groups: int) -> State:
         np.array(latencies, np.int64),
         sms,
         pipes,
-        np.zeros(num_sms * MAX_WARPS, records.WARP),
+        records.zeros(num_sms * MAX_WARPS, records.WARP),
         tags[0],
         tags[1],
         tags[2],
@@ -449,6 +450,7 @@ def build(gpu: Gpu, fetch_path: str, num_groups: int) -> State:
         _route(gpu.l2),
         _route(gpu.llc),
         _memory(gpu, last.num_channels),
+        l1_banks,
         np.zeros(
             (num_sms * units * l1_timing.num_banks, power_of_two(latency + 1)), records.WAITING
         ),

@@ -182,24 +182,24 @@ def _drain_misses(state, unit):  # type: ignore[no-untyped-def]
 
 
 @small
-def _may_succeed(state, pipe, node, bank):  # type: ignore[no-untyped-def]
+def _may_succeed(state, node, bank):  # type: ignore[no-untyped-def]
     """Whether something has changed that a failed look-up waits for."""
-    if pipe.bank_failed[bank] == node.version:
+    if bank.failed == node.version:
         return False
-    reason = pipe.bank_reason[bank]
-    if reason == NO_OTHER or pipe.bank_filled[bank] != node.num_filled:
+    reason = bank.reason
+    if reason == NO_OTHER or bank.filled != node.num_filled:
         return True
     level = state.l1.level[0]
     if reason == NO_QUEUE:
         return node.miss_count + 1 < level.miss_queue
-    return node.mshr_used < level.num_mshrs or pipe.bank_taken[bank] != node.num_taken
+    return node.mshr_used < level.num_mshrs or bank.taken != node.num_taken
 
 
 @small
 def _note_fail(pipe, bank):  # type: ignore[no-untyped-def]
     """The look-up of a bank has failed."""
     pipe.blocked = R_L1_RESERVATION
-    if pipe.bank_write[bank]:
+    if bank.write:
         pipe.write_fails += 1
     else:
         pipe.read_fails += 1
@@ -214,36 +214,37 @@ def _look_up(state, unit):  # type: ignore[no-untyped-def]
     room = state.banks.shape[1] - 1
     now = machine.now
     # Where `lines_per_cycle` rules, "bank" k is the k-th access that entered in a cycle.
-    for bank in range(machine.num_banks):
-        if pipe.bank_count[bank] == 0:
+    for k in range(machine.num_banks):
+        at = unit * machine.num_banks + k
+        bank = state.l1_banks[at]
+        if bank.count == 0:
             continue
-        if pipe.bank_ready[bank] > now:
-            pipe.until = min(pipe.until, pipe.bank_ready[bank])
+        if bank.ready > now:
+            pipe.until = min(pipe.until, bank.ready)
             continue
-        if pipe.bank_failed[bank] >= 0 and not _may_succeed(state, pipe, node, bank):
-            state.l1.outcomes[pipe.bank_write[bank], FAIL] += 1
+        if bank.failed >= 0 and not _may_succeed(state, node, bank):
+            state.l1.outcomes[bank.write, FAIL] += 1
             _note_fail(pipe, bank)
             continue
-        at = unit * machine.num_banks + bank
-        request = state.banks[at, pipe.bank_head[bank] & room].request
+        request = state.banks[at, bank.head & room].request
         one = state.pool.requests[request]
         outcome, sent = access(state.l1, state.pool, unit, request, now)
         if outcome == FAIL:
-            pipe.bank_failed[bank] = node.version
-            pipe.bank_reason[bank] = node.fail_reason
-            pipe.bank_filled[bank] = node.num_filled
-            pipe.bank_taken[bank] = node.num_taken
-            pipe.bank_write[bank] = one.write
+            bank.failed = node.version
+            bank.reason = node.fail_reason
+            bank.filled = node.num_filled
+            bank.taken = node.num_taken
+            bank.write = one.write
             _note_fail(pipe, bank)
             continue
         pipe.has_moved = 1
-        pipe.bank_failed[bank] = -1
-        pipe.bank_head[bank] = (pipe.bank_head[bank] + 1) & room
-        pipe.bank_count[bank] -= 1
+        bank.failed = -1
+        bank.head = (bank.head + 1) & room
+        bank.count -= 1
         pipe.in_banks -= 1
-        if pipe.bank_count[bank] > 0:
-            following = state.banks[at, pipe.bank_head[bank] & room]
-            pipe.bank_ready[bank] = following.time
+        if bank.count > 0:
+            following = state.banks[at, bank.head & room]
+            bank.ready = following.time
             # It is looked up in a later cycle; until then the host fetches what that needs.
             prefetch(state.pool.requests, following.request)  # type: ignore[call-arg]
             prefetch(state.l1.buckets, following.entered)
@@ -360,23 +361,25 @@ def _issue_accesses(state, unit):  # type: ignore[no-untyped-def]
             index = _new_request(state, unit, address, at, sector)
             fifo.access(state, unit, index)
         else:
-            bank = (address >> machine.bank_shift) & (machine.num_banks - 1)
+            which = (address >> machine.bank_shift) & (machine.num_banks - 1)
             if machine.lines_per_cycle > 0:
-                bank = k
-            if pipe.bank_count[bank] >= machine.l1_latency or pipe.bank_entered[bank] == now:
+                which = k
+            which += unit * machine.num_banks
+            bank = state.l1_banks[which]
+            if bank.count >= machine.l1_latency or bank.entered == now:
                 machine.bank_conflicts += 1
                 pipe.clashes = 1
                 return _out_of_bandwidth(pipe)
             index = _new_request(state, unit, address, at, sector)
-            place = (pipe.bank_head[bank] + pipe.bank_count[bank]) & room
-            waiting = state.banks[unit * machine.num_banks + bank, place]
+            place = (bank.head + bank.count) & room
+            waiting = state.banks[which, place]
             waiting.request = index
             waiting.time = now + machine.l1_latency
             waiting.entered = bucket_of(state.l1, unit, work.asks[at].line)
-            if pipe.bank_count[bank] == 0:
-                pipe.bank_ready[bank] = now + machine.l1_latency
-            pipe.bank_count[bank] += 1
-            pipe.bank_entered[bank] = now
+            if bank.count == 0:
+                bank.ready = now + machine.l1_latency
+            bank.count += 1
+            bank.entered = now
             pipe.in_banks += 1
         pipe.mask &= ~(1 << sector)
         pipe.is_located = 0

@@ -138,39 +138,38 @@ MSHR = np.dtype(
 )
 
 #: One instance of a level: an L1 unit, a GL1, a slice.
-NODE = np.dtype(
-    [
-        ("wake", "i8"),
-        ("port_time", "i8"),  # in 1/256 core cycles: when the data port is free
-        ("fill_time", "i8"),
-        ("version", "i8"),  # counts what may turn a reservation fail into success
-        ("failed", "i8"),  # version at which the head of the queue failed, or -1
-        ("failed_write", "i8"),  # whether it is a store
-        ("is_stalled", "i8"),  # whether the last step's look-up failed: so does each until the next
-        ("last_step", "i8"),
-        ("fail_reason", "i8"),  # of the last look-up that failed
-        ("num_filled", "i8"),  # counts what may turn a miss into a hit
-        ("num_taken", "i8"),  # MSHRs taken so far
-        ("delay_ready", "i8"),  # of the oldest request in the delay
-        ("dirty_lines", "i8"),
-        ("mshr_free", "i4"),
-        ("mshr_used", "i4"),
-        ("ready_first", "i4"),
-        ("ready_last", "i4"),
-        ("in_head", "i4"),
-        ("in_count", "i4"),
-        ("delay_head", "i4"),
-        ("delay_count", "i4"),
-        ("miss_head", "i4"),
-        ("miss_count", "i4"),
-        ("down_head", "i4"),
-        ("down_count", "i4"),
-        ("fill_head", "i4"),
-        ("fill_count", "i4"),
-        ("out_head", "i4"),
-        ("out_count", "i4"),
-    ],
-    align=True,
+NODE = _in_lines(
+    # One line: what every step looks at.
+    ("wake", "i8"),
+    ("port_time", "i8"),  # in 1/256 core cycles: when the data port is free
+    ("fill_time", "i8"),
+    ("delay_ready", "i8"),  # of the oldest request in the delay
+    ("ready_first", "i4"),
+    ("fill_count", "i4"),
+    ("miss_count", "i4"),
+    ("in_count", "i4"),
+    ("out_count", "i4"),
+    ("down_count", "i4"),
+    ("delay_count", "i4"),
+    ("is_stalled", "i4"),  # whether the last step's look-up failed: so does each until the next
+    # The other: what a step that moves something needs.
+    ("version", "i4"),  # counts what may turn a reservation fail into success
+    ("failed", "i4"),  # version at which the head of the queue failed, or -1
+    ("last_step", "i8"),
+    ("num_filled", "i4"),  # counts what may turn a miss into a hit
+    ("num_taken", "i4"),  # MSHRs taken so far
+    ("dirty_lines", "i4"),
+    ("mshr_free", "i4"),
+    ("mshr_used", "i4"),
+    ("ready_last", "i4"),
+    ("in_head", "i4"),
+    ("delay_head", "i4"),
+    ("miss_head", "i4"),
+    ("down_head", "i4"),
+    ("fill_head", "i2"),
+    ("out_head", "i2"),
+    ("failed_write", "i2"),  # whether what failed is a store
+    ("fail_reason", "i2"),  # of the last look-up that failed
 )
 
 #: The rules and sizes of one level.
@@ -189,128 +188,126 @@ LEVEL = np.dtype(
 )  # fmt: skip
 
 #: What LDST and issue logic of one SM need.
-SM = np.dtype(
-    [
-        ("wake", "i8"),
-        ("last_step", "i8"),
-        ("last_reason", "i8"),
-        ("num_timed", "i8"),
-        ("num_resident", "i8"),
-        ("num_blocked", "i8"),
-        ("resident_since", "i8"),
-        # Until then, and until something new comes or room is made, stepping the collectors
-        # changes nothing.
-        ("collect_from", "i8"),
-        ("waits_for_room", "i4"),  # whether it sleeps until its port has room
-        ("is_stuck", "i4"),  # whether nothing can issue until something changes
-        ("num_collecting", "i4"),
-        ("eject_head", "i4"),
-        ("eject_count", "i4"),
-        ("free_places", "i4"),
-        ("num_issued", "i4", (5,)),  # of each kind, not yet in a collector
-        ("ready", "u8", (5,)),
-        ("age", "i8", (MAX_WARPS,)),  # of the warp in each slot, the oldest least
-        ("last_issued", "i4", (MAX_SCHEDULERS,)),
-        ("unit_free", "i8", (MAX_SCHEDULERS, 4)),
-        ("queue_head", "i4", (MAX_SCHEDULERS,)),
-        ("queue_count", "i4", (MAX_SCHEDULERS,)),
-        # GPGPU-Sim's operand collectors: issued[kind, scheduler], then collector[scheduler, unit].
-        ("issued_slot", "i4", (5, MAX_SCHEDULERS)),
-        ("issued_order", "i8", (5, MAX_SCHEDULERS)),
-        ("issued_chain", "i4", (5, MAX_SCHEDULERS)),
-        ("issued_kind", "i4", (5, MAX_SCHEDULERS)),
-        ("issued_row", "i8", (MAX_SCHEDULERS,)),
-        ("issued_load", "i4", (MAX_SCHEDULERS,)),
-        ("collector_slot", "i4", (MAX_SCHEDULERS, MAX_COLLECTORS)),
-        ("collector_kind", "i4", (MAX_SCHEDULERS, MAX_COLLECTORS)),
-        ("collector_chain", "i4", (MAX_SCHEDULERS, MAX_COLLECTORS)),
-        ("collector_ready", "i4", (MAX_SCHEDULERS, MAX_COLLECTORS)),
-        ("collector_order", "i8", (MAX_SCHEDULERS, MAX_COLLECTORS)),
-        ("collector_row", "i8", (MAX_SCHEDULERS, MAX_COLLECTORS)),
-        ("collector_load", "i4", (MAX_SCHEDULERS, MAX_COLLECTORS)),
-        ("order", "i8"),
-        # Queues of the load/store unit, place by place: most hold one.
-        ("queue_warp", "i4", (MAX_MEMORY_QUEUE, MAX_SCHEDULERS)),
-        ("queue_time", "i8", (MAX_MEMORY_QUEUE, MAX_SCHEDULERS)),
-        ("queue_row", "i8", (MAX_MEMORY_QUEUE, MAX_SCHEDULERS)),
-        ("queue_load", "i4", (MAX_MEMORY_QUEUE, MAX_SCHEDULERS)),
-        ("wheel", "u8", (WHEEL,)),
-    ],
-    align=True,
+SM = _in_lines(
+    # Two lines: what every step looks at.
+    ("wake", "i8"),
+    ("last_step", "i8"),
+    # Until then, and until something new comes or room is made, stepping the collectors changes
+    # nothing.
+    ("collect_from", "i8"),
+    ("last_reason", "i4"),
+    ("eject_head", "i4"),
+    ("eject_count", "i4"),
+    ("waits_for_room", "i4"),  # whether it sleeps until its port has room
+    ("num_timed", "i4"),
+    ("num_resident", "i4"),
+    ("num_blocked", "i4"),
+    ("is_stuck", "i4"),  # whether nothing can issue until something changes
+    ("num_collecting", "i4"),
+    ("free_places", "i4"),
+    ("ready", "u8", (5,)),
+    ("queue_count", "i1", (MAX_SCHEDULERS,)),
+    ("queue_head", "i1", (MAX_SCHEDULERS,)),
+    # GPGPU-Sim's operand collectors: issued[kind, scheduler], then collector[unit, scheduler].
+    ("num_issued", "i1", (8,)),  # of each kind, not yet in a collector
+    ("resident_since", "i8"),
+    ("order", "i8"),
+    ("issued_slot", "i1", (5, MAX_SCHEDULERS)),
+    ("issued_kind", "i1", (5, MAX_SCHEDULERS)),
+    ("issued_chain", "i1", (5, MAX_SCHEDULERS)),
+    ("collector_slot", "i1", (MAX_COLLECTORS, MAX_SCHEDULERS)),
+    ("collector_ready", "i1", (MAX_COLLECTORS, MAX_SCHEDULERS)),
+    ("collector_kind", "i1", (MAX_COLLECTORS, MAX_SCHEDULERS)),
+    ("collector_chain", "i1", (MAX_COLLECTORS, MAX_SCHEDULERS)),
+    ("unit_free", "i8", (4, MAX_SCHEDULERS)),
+    ("last_issued", "i4", (MAX_SCHEDULERS,)),
+    ("issued_order", "i8", (5, MAX_SCHEDULERS)),
+    ("issued_row", "i8", (MAX_SCHEDULERS,)),
+    ("issued_load", "i4", (MAX_SCHEDULERS,)),
+    ("collector_order", "i8", (MAX_COLLECTORS, MAX_SCHEDULERS)),
+    ("collector_row", "i8", (MAX_COLLECTORS, MAX_SCHEDULERS)),
+    ("collector_load", "i4", (MAX_COLLECTORS, MAX_SCHEDULERS)),
+    # Queues of the load/store unit, place by place: most hold one.
+    ("queue_warp", "i4", (MAX_MEMORY_QUEUE, MAX_SCHEDULERS)),
+    ("queue_time", "i8", (MAX_MEMORY_QUEUE, MAX_SCHEDULERS)),
+    ("queue_row", "i8", (MAX_MEMORY_QUEUE, MAX_SCHEDULERS)),
+    ("queue_load", "i4", (MAX_MEMORY_QUEUE, MAX_SCHEDULERS)),
+    ("age", "i8", (MAX_WARPS,)),  # of the warp in each slot, the oldest least
+    ("wheel", "u8", (WHEEL,)),
 )
 
 #: The load/store and texture pipe in front of one L1 unit.
-PIPE = np.dtype(
-    [
-        ("warp", "i4"),  # whose instruction it works on, or -1
-        ("load", "i4"),
-        ("at", "i8"),  # request it works on, downwards
-        ("first", "i8"),
-        ("mask", "i8"),  # sectors of that request still to do
-        ("left", "i8"),  # sectors of the instruction still to do
-        ("code", "i4"),  # instruction
-        ("path", "i4"),
-        ("is_located", "i4"),  # whether the sector at hand has been located
-        ("slice", "i4"),  # its L2 slice, or -1: not known yet
-        ("number", "i8"),  # its line number there
-        ("free_at", "i8"),  # when the tag, data and filter laws allow the next instruction
-        ("next_writeback", "i4"),
-        ("next_global", "i4"),
-        ("client", "i4"),
-        ("response_head", "i4"),
-        ("response_count", "i4"),
-        ("bank_head", "i4", (MAX_BANKS,)),
-        ("bank_count", "i4", (MAX_BANKS,)),
-        ("bank_entered", "i8", (MAX_BANKS,)),
-        ("bank_failed", "i8", (MAX_BANKS,)),
-        ("bank_ready", "i8", (MAX_BANKS,)),  # of the oldest access in it
-        ("bank_write", "i4", (MAX_BANKS,)),  # whether the one that failed is a store
-        ("bank_reason", "i4", (MAX_BANKS,)),  # why it failed
-        ("bank_filled", "i8", (MAX_BANKS,)),  # the node's num_filled and num_taken then
-        ("bank_taken", "i8", (MAX_BANKS,)),
-        ("in_banks", "i8"),
-        ("blocked", "i4"),  # 0, or why nothing left the pipe this cycle
-        # Of the last step; if it changed nothing, each cycle until the next has the same fails.
-        ("has_moved", "i4"),
-        ("until", "i8"),  # when it may move without news from outside
-        ("read_fails", "i4"),
-        ("write_fails", "i4"),
-        ("clashes", "i4"),
-        # The texture FIFOs.
-        ("rob_count", "i4"),
-        ("fragment_count", "i4"),
-        ("request_head", "i4"),
-        ("request_count", "i4"),
-        ("result_count", "i4"),
-        ("result_head", "i4"),
-        ("fragment_head", "i4"),
-    ],
-    align=True,
+PIPE = _in_lines(
+    ("warp", "i4"),  # whose instruction it works on, or -1
+    ("next_writeback", "i4"),
+    ("next_global", "i4"),
+    ("client", "i4"),
+    ("response_head", "i4"),
+    ("response_count", "i4"),
+    ("in_banks", "i4"),
+    ("blocked", "i4"),  # 0, or why nothing left the pipe this cycle
+    # Of the last step; if it changed nothing, each cycle until the next has the same fails.
+    ("has_moved", "i4"),
+    ("read_fails", "i4"),
+    ("write_fails", "i4"),
+    ("clashes", "i4"),
+    ("until", "i8"),  # when it may move without news from outside
+    ("free_at", "i8"),  # when the tag, data and filter laws allow the next instruction
+    # The instruction at hand.
+    ("at", "i8"),  # request it works on, downwards
+    ("first", "i8"),
+    ("mask", "i4"),  # sectors of that request still to do
+    ("left", "i4"),  # sectors of the instruction still to do
+    ("load", "i4"),
+    ("code", "i4"),  # instruction
+    ("number", "i8"),  # line number of the sector at hand in its L2 slice
+    ("slice", "i4"),  # that slice, or -1: not known yet
+    ("path", "i2"),
+    ("is_located", "i2"),  # whether the sector at hand has been located
+    # The texture FIFOs.
+    ("rob_count", "i4"),
+    ("fragment_count", "i4"),
+    ("request_head", "i4"),
+    ("request_count", "i4"),
+    ("result_count", "i4"),
+    ("result_head", "i4"),
+    ("fragment_head", "i4"),
 )
 
-WARP = np.dtype(
-    [
-        ("row", "i8"),
-        ("rows_left", "i8"),
-        ("operation", "i4"),  # micro-operation
-        ("last_operation", "i4"),
-        ("left", "i4"),  # of the micro-operation's count
-        ("chain", "i4"),
-        ("parity", "i4"),
-        ("in_trailer", "i4"),
-        ("waits_chain", "i4"),  # for the unknown end of this chain, or -1
-        ("waits_for", "i4"),  # loads up to this sequence number must be back; -1 = not waiting
-        ("next_load", "i4"),
-        ("oldest_load", "i4"),
-        ("stores", "i4"),
-        ("cta", "i4"),  # place
-        ("alive", "i4"),
-        ("int_ready", "i8"),
-        ("exit_ready", "i8"),  # when its exit has left the pipeline
-        ("chains_ready", "i8", (3,)),
-        ("pending", "i4", (MAX_LOADS,)),
-    ],
-    align=True,
+#: A bank of an L1 unit: the accesses on their way to the tags.
+L1_BANK = _in_lines(
+    ("ready", "i8"),  # when the oldest access may be looked up
+    ("head", "i4"),
+    ("count", "i4"),
+    ("entered", "i8"),  # the last cycle in which one entered
+    ("failed", "i8"),  # version of the unit's node at which the oldest failed, or -1
+    ("filled", "i8"),  # the node's num_filled and num_taken then
+    ("taken", "i8"),
+    ("write", "i4"),  # whether what failed is a store
+    ("reason", "i4"),  # why it failed
+)
+
+WARP = _in_lines(
+    # One line: what a sector that comes back touches, and what waits for it.
+    ("waits_for", "i4"),  # loads up to this sequence number must be back; -1 = not waiting
+    ("oldest_load", "i4"),
+    ("next_load", "i4"),
+    ("stores", "i4"),
+    ("operation", "i4"),  # micro-operation
+    ("last_operation", "i4"),
+    ("left", "i4"),  # of the micro-operation's count
+    ("in_trailer", "i2"),
+    ("chain", "i2"),
+    ("row", "i8"),
+    ("int_ready", "i8"),
+    ("rows_left", "i8"),
+    ("waits_chain", "i4"),  # for the unknown end of this chain, or -1
+    ("parity", "i2"),
+    ("alive", "i2"),
+    ("exit_ready", "i8"),  # when its exit has left the pipeline
+    ("chains_ready", "i8", (3,)),
+    ("cta", "i4"),  # place
+    ("pending", "i2", (MAX_LOADS,)),
 )
 
 #: A static access instruction, and the micro-operations before it.

@@ -89,38 +89,38 @@ def _dispatch(state, index, s, c):  # type: ignore[no-untyped-def]
     machine = state.pool.machine[0]
     sm = state.sms[index]
     now = machine.now
-    kind = sm.collector_kind[s, c]
+    kind = sm.collector_kind[c, s]
     if kind == MEMORY:
         if sm.queue_count[s] > 0:
             return False
         sm.queue_head[s] = 0
         sm.queue_count[s] = 1
-        sm.queue_warp[0, s] = sm.collector_slot[s, c]
+        sm.queue_warp[0, s] = sm.collector_slot[c, s]
         # The load/store unit takes the oldest of those that are there.
-        sm.queue_time[0, s] = sm.collector_order[s, c]
-        sm.queue_row[0, s] = sm.collector_row[s, c]
-        sm.queue_load[0, s] = sm.collector_load[s, c]
+        sm.queue_time[0, s] = sm.collector_order[c, s]
+        sm.queue_row[0, s] = sm.collector_row[c, s]
+        sm.queue_load[0, s] = sm.collector_load[c, s]
     else:
         unit = _unit_of(machine, kind)
         # One instruction may wait between collector and unit.
-        if sm.unit_free[s, unit] - state.latencies[kind, 1] > now:
+        if sm.unit_free[unit, s] - state.latencies[kind, 1] > now:
             return False
-        slot = sm.collector_slot[s, c]
+        slot = sm.collector_slot[c, s]
         warp = state.warps[index * MAX_WARPS + slot]
-        is_last = sm.collector_chain[s, c] < 0
-        start = max(now + 1, sm.unit_free[s, unit])
-        sm.unit_free[s, unit] = start + (1 if is_last else state.latencies[kind, 1])
+        is_last = sm.collector_chain[c, s] < 0
+        start = max(now + 1, sm.unit_free[unit, s])
+        sm.unit_free[unit, s] = start + (1 if is_last else state.latencies[kind, 1])
         done = start + state.latencies[kind, 0] + machine.result_cycles - _AHEAD
         if is_last:
             warp.exit_ready = start + machine.result_cycles - _AHEAD + 1
         else:
-            warp.chains_ready[sm.collector_chain[s, c]] = done
+            warp.chains_ready[sm.collector_chain[c, s]] = done
         if kind == INT:
             warp.int_ready = done
         if warp.waits_chain >= 0:
             warp.waits_chain = -1
             schedule(state, index, slot, now + 1)
-    sm.collector_slot[s, c] = -1
+    sm.collector_slot[c, s] = -1
     sm.num_collecting -= 1
     return True
 
@@ -139,19 +139,19 @@ def _allocate(state, index, kind):  # type: ignore[no-untyped-def]
     if oldest < 0:
         return False
     for c in range(machine.collector_units):
-        if sm.collector_slot[oldest, c] >= 0:
+        if sm.collector_slot[c, oldest] >= 0:
             continue
-        sm.collector_slot[oldest, c] = sm.issued_slot[kind, oldest]
-        sm.collector_kind[oldest, c] = sm.issued_kind[kind, oldest]
+        sm.collector_slot[c, oldest] = sm.issued_slot[kind, oldest]
+        sm.collector_kind[c, oldest] = sm.issued_kind[kind, oldest]
         # One operand is read a step: arithmetic has two, a memory instruction its address, an exit
         # none.
         exits = sm.issued_chain[kind, oldest] < 0
-        sm.collector_ready[oldest, c] = 1 if exits else 0 if kind == MEMORY else -1
-        sm.collector_order[oldest, c] = order
-        sm.collector_chain[oldest, c] = sm.issued_chain[kind, oldest]
+        sm.collector_ready[c, oldest] = 1 if exits else 0 if kind == MEMORY else -1
+        sm.collector_order[c, oldest] = order
+        sm.collector_chain[c, oldest] = sm.issued_chain[kind, oldest]
         if kind == MEMORY:
-            sm.collector_row[oldest, c] = sm.issued_row[oldest]
-            sm.collector_load[oldest, c] = sm.issued_load[oldest]
+            sm.collector_row[c, oldest] = sm.issued_row[oldest]
+            sm.collector_load[c, oldest] = sm.issued_load[oldest]
         sm.issued_slot[kind, oldest] = -1
         sm.num_issued[kind] -= 1
         sm.is_stuck = 0
@@ -173,14 +173,14 @@ def _collect(state, index):  # type: ignore[no-untyped-def]
     for _ in range(2):
         for s in range(machine.num_schedulers):
             for c in range(machine.collector_units):
-                if sm.collector_slot[s, c] < 0:
+                if sm.collector_slot[c, s] < 0:
                     continue
-                if sm.collector_ready[s, c] <= 0:
-                    sm.collector_ready[s, c] += 1
+                if sm.collector_ready[c, s] <= 0:
+                    sm.collector_ready[c, s] += 1
                     changed = True
                 elif _dispatch(state, index, s, c):
                     changed = True
-                elif sm.collector_kind[s, c] != MEMORY:
+                elif sm.collector_kind[c, s] != MEMORY:
                     later = now + 1
         # Each of the ports takes the oldest of every kind in turn; one that finds no collector of
         # its scheduler free blocks its kind.
@@ -226,8 +226,8 @@ def _start_arithmetic(state, index, scheduler, warp, kind, now):  # type: ignore
     machine = state.pool.machine[0]
     sm = state.sms[index]
     unit = _unit_of(machine, kind)
-    start = max(now + _AHEAD, sm.unit_free[scheduler, unit])
-    sm.unit_free[scheduler, unit] = start + state.latencies[kind, 1]
+    start = max(now + _AHEAD, sm.unit_free[unit, scheduler])
+    sm.unit_free[unit, scheduler] = start + state.latencies[kind, 1]
     done = start + state.latencies[kind, 0] + machine.result_cycles - _AHEAD
     if is_exit(warp):
         warp.exit_ready = start + machine.result_cycles - _AHEAD + 1
@@ -263,7 +263,7 @@ def _has_room(state, index, scheduler, kind, now):  # type: ignore[no-untyped-de
         return sm.issued_slot[_unit_of(machine, kind), scheduler] < 0
     if kind == MEMORY:
         return sm.queue_count[scheduler] < machine.memory_queue
-    return sm.unit_free[scheduler, _unit_of(machine, kind)] <= now + _AHEAD
+    return sm.unit_free[_unit_of(machine, kind), scheduler] <= now + _AHEAD
 
 
 @compiled
@@ -371,8 +371,9 @@ def _next_event(state, index):  # type: ignore[no-untyped-def]
                 return now + 1
         if pipe.in_banks > 0:
             for bank in range(machine.num_banks):
-                if pipe.bank_count[bank] > 0:
-                    soonest = min(soonest, max(now + 1, pipe.bank_ready[bank]))
+                one = state.l1_banks[unit * machine.num_banks + bank]
+                if one.count > 0:
+                    soonest = min(soonest, max(now + 1, one.ready))
     return _next_timed(sm, now, soonest)
 
 

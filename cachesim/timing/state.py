@@ -81,8 +81,9 @@ class State(NamedTuple):
     """The machine.
 
     latencies: (4, 2) int64 of the execution units, latency and initiation by kind.
-    banks: (units * banks, room) `records.WAITING`, the L1's delay lines. port_of: (units,) int32,
-    the interconnect's port of an L1 unit. responses: (units, room) int32.
+    l1_banks: (units * banks,), banks: (units * banks, room) `records.WAITING`, the L1's delay
+    lines. port_of: (units,) int32, the interconnect's port of an L1 unit. responses: (units, room)
+    int32.
     ejection: (SMs, room) int32; cta_at: (SMs, places) int64; warps_left: the same.
     fifo: (units, 3, room) int32, the texture L1's reorder buffer, requests and results.
     scheduler_masks: (schedulers,) uint64. reasons: (reasons,) int64 SM-cycles.
@@ -105,6 +106,7 @@ class State(NamedTuple):
     l2_route: Route
     llc_route: Route
     memory: Memory
+    l1_banks: npt.NDArray[np.void]
     banks: npt.NDArray[np.void]
     port_of: npt.NDArray[np.int32]
     responses: npt.NDArray[np.int32]
@@ -211,6 +213,7 @@ define(
         "l2_route": "Route",
         "llc_route": "Route",
         "memory": "Memory",
+        "l1_banks": (records.L1_BANK, 1),
         "banks": (records.WAITING, 2),
         "port_of": (_I32, 1),
         "responses": (_I32, 2),
