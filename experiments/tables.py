@@ -96,6 +96,11 @@ def cells(table: Table) -> list[list[str]]:
 
 
 def _scalar(value: Any) -> Any:
+    """A number of Python's own; None for the missing whole number of pandas, which is no float."""
+    from pandas import NA
+
+    if value is NA:
+        return None
     return value.item() if hasattr(value, "item") else value
 
 

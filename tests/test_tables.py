@@ -119,3 +119,8 @@ def test_nothing_is_cut_short_however_narrow_the_terminal(
     for words in ("1,234,567", "50% & more", "0.877"):
         assert any(words in line for line in said.splitlines())
     assert "…" not in said
+
+
+def test_a_missing_whole_number_is_shown_as_missing() -> None:
+    frame = pd.DataFrame({"halved": pd.array([None, 4096], "Int64")})
+    assert cells(Table("Sensitivity", frame, (Column("halved", "halved"),))) == [["-"], ["4,096"]]
