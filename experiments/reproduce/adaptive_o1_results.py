@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 PAPER, LAST, ENGINE = "paper, kappa 0.2", "last frame alone", "engine"
 #: A value within this factor of the printed one agrees with it.
 AGREES_WITHIN = 1.5
+#: Frames of one pixel's count that the figure shows.
+PIXEL_FRAMES = 120
 OVERLAY_COLUMNS = (
     "local pixels that differ",
     "difference in the trail",
@@ -285,6 +287,9 @@ def series_figure(series: dict[str, Arrays]) -> Figure:
     ):
         for region in (EDGE, FLAT):
             lines = {key: column(found, region, name) for key, found in series.items()}
+            if name == "pixel_count":
+                # One pixel's count jumps every frame: all lines over all frames hide one another.
+                lines = {key: lines[key][:PIXEL_FRAMES] for key in (PAPER, LAST) if key in lines}
             limits = (0.0, 68.0) if not is_log else None
             panels.append(Panel(region, label, lines, is_log=is_log, limits=limits))
     return line_figure(panels, 2)
