@@ -17,6 +17,11 @@ U64 = np.uint64
 DRAWN, NEXT, NUMBERS = 0, 1, 2
 TABLE = NUMBERS + 31
 _LAG = 31
+#: Bits of an entry that hold the slice; those above hold the run.
+_SLICE_BITS = 16
+_SLICES = (1 << _SLICE_BITS) - 1
+#: Runs that differ above these bits share their slice: no GPU has so many addresses.
+_RUNS = (1 << 63 - _SLICE_BITS) - 1
 
 
 def generator(seed: int = 1) -> npt.NDArray[np.int64]:
@@ -34,7 +39,7 @@ def generator(seed: int = 1) -> npt.NDArray[np.int64]:
 
 def new_draws(size: int) -> npt.NDArray[np.int64]:
     """An empty table of drawn runs with room for `size` entries (a power of two)."""
-    draws = np.full(TABLE + 2 * size, -1, np.int64)
+    draws = np.full(TABLE + size, -1, np.int64)
     draws[DRAWN] = draws[NEXT] = 0
     draws[NUMBERS:TABLE] = generator()
     return draws
@@ -42,30 +47,29 @@ def new_draws(size: int) -> npt.NDArray[np.int64]:
 
 def larger_draws(draws: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
     """The same draws in a table of twice the size."""
-    entries = draws[TABLE:].reshape(-1, 2)
-    larger = new_draws(2 * len(entries))
+    larger = new_draws(2 * (len(draws) - TABLE))
     larger[:TABLE] = draws[:TABLE]
-    for run, where in entries[entries[:, 0] >= 0]:
-        _put(larger, run, where)
+    _copy_entries(draws, larger)
     return larger
 
 
 @small
 def _slot(draws, run):  # type: ignore[no-untyped-def]
     """Where a run stands in the table, or would stand."""
-    mask = (len(draws) - TABLE) // 2 - 1
+    mask = len(draws) - TABLE - 1
     # Eight neighbours stand together.
     at = ((((run >> 3) * 0x1E3779B97F4A7C15) >> 24 << 3) | (run & 7)) & mask
-    while draws[TABLE + 2 * at] >= 0 and draws[TABLE + 2 * at] != run:
+    while draws[TABLE + at] >= 0 and draws[TABLE + at] >> _SLICE_BITS != run:
         at = (at + 1) & mask
-    return TABLE + 2 * at
+    return TABLE + at
 
 
 @compiled
-def _put(draws, run, where):  # type: ignore[no-untyped-def]
-    at = _slot(draws, run)
-    draws[at] = run
-    draws[at + 1] = where
+def _copy_entries(draws, larger):  # type: ignore[no-untyped-def]
+    for place in range(TABLE, len(draws)):
+        entry = draws[place]
+        if entry >= 0:
+            larger[_slot(larger, entry >> _SLICE_BITS)] = entry
 
 
 @compiled
@@ -84,13 +88,13 @@ def _draw(draws, slices):  # type: ignore[no-untyped-def]
 @compiled
 def _drawn(route, address):  # type: ignore[no-untyped-def]
     """The slice of an address under a random partition, drawn if nobody asked for it before."""
-    run = address >> route.numbers[2]
+    run = (address >> route.numbers[2]) & _RUNS
     at = _slot(route.draws, run)
     if route.draws[at] < 0:
-        route.draws[at] = run
-        route.draws[at + 1] = _draw(route.draws, route.numbers[4])
+        where = _draw(route.draws, route.numbers[4])
+        route.draws[at] = run << _SLICE_BITS | where
         route.draws[DRAWN] += 1
-    return route.draws[at + 1]
+    return route.draws[at] & _SLICES
 
 
 @small
@@ -122,4 +126,4 @@ def locate(route, address):  # type: ignore[no-untyped-def]
 @small
 def is_filling_table(draws):  # type: ignore[no-untyped-def]
     """Whether a table of draws is half full."""
-    return draws[DRAWN] * 4 > len(draws) - TABLE
+    return draws[DRAWN] * 2 > len(draws) - TABLE
