@@ -1,0 +1,245 @@
+"""The dissertation's bandwidth-demand cost function, measured: a frame's demand on L1, L2 and DRAM
+and its cycles, without simulating it.
+
+The slides give the formulas and no prose; this is how their symbols are read here.
+
+    T(n)  = k T'_k(n/k) + O(n)
+    T'(n) = sum over i, a in A, r in R of w_iar S_iar + O(n)
+    S(m)  = sum over j = 1..m' of M(d_j) + O(m'),   m' = f(m, sigma_0^2) <= m
+    M(d)  = R(d) + O(d)
+
+`SYMBOLS` says what each one is, in which unit, and where it is computed. Costs have four components
+that are predicted side by side: bytes asked of L1, of L2, bytes moved by DRAM, and cycles.
+
+R(d) has no closed form: what a read costs depends on its distance, on its mip, on what the warp's
+other lanes ask (`footprint`), on which tiles share an L1 and how long its lines last
+(`tiles`), and on what the frame has left in the caches behind (`window`). All that
+follows from the method and the preset; a handful of efficiencies per GPU, `COEFFICIENTS`, are
+fitted to simulated frames (`fit`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import pandas as pd
+
+from cachesim.config import Gpu
+from cachesim.cost.cycles import LIMITS, has_timing, launch_cycles, limit_times
+from cachesim.cost.frame import Frame, Step, build_frame
+from cachesim.cost.machine import Machine
+from cachesim.cost.tiles import ClassMisses, ScatterSpread, l1_misses, spread_scatter
+from cachesim.cost.window import Passed, pass_level
+from cachesim.cost.workload import Workload
+
+#: (symbol, meaning, unit, where it comes from).
+SYMBOLS = (
+    ("n", "shading units: the pixels that scatter", "pixels", "the G-buffer's mask"),
+    ("i", "one shading unit; handled as one of its tile, whose pixels cost alike", "-", "tiles"),
+    ("k", "groups of units: the CTAs of a launch, 8x8 pixels each, as the SMs take them",
+     "groups", "dispatch"),
+    ("T'_k(n/k)", "cost of one group: what its samples ask of each level; in cycles, its share "
+     "of the busiest SM's time", "B, cycles", "tiles, cycles"),
+    ("T(n)", "cost of the frame", "B, cycles", "Prediction"),
+    ("a in A", "technique of a tile: sampled (AFIS) or filtered (Separable)", "-", "launches"),
+    ("r in R", "rate: full resolution alone, since no method here renders at another", "-", "1"),
+    ("w_iar", "1 where the hybrid's classes give tile i technique a, else 0; always 1 where there "
+     "is one technique", "-", "tile lists of the hybrid"),
+    ("S_iar = S(m)", "cost of the samples of a pixel", "B, cycles", "tiles"),
+    ("m", "budget: most samples that a pixel may take", "samples", "num_samples or b_max"),
+    ("sigma_0^2", "target variance of the tracked luminance", "luminance^2", "the method"),
+    ("m' = f(m, sigma_0^2)", "samples that the pixel takes: m, or what the adaptive estimator "
+     "says after some frames", "samples", "the estimator run on the scene"),
+    ("d_j", "distance of sample j from its pixel; its mip follows from it by Eq 5.12", "mm",
+     "quantiles of the profile"),
+    ("M(d)", "cost of one sample at distance d", "B, cycles", "R(d) + O(d)"),
+    ("R(d)", "its reads: sectors that the warp's lanes do not share, and what the caches do not "
+     "hold", "B", "footprint, window"),
+    ("O(d)", "what comes with it: its arithmetic, and its share of making the mips",
+     "B, cycles", "prefilter's sweeps, instruction counts"),
+    ("O(m')", "cost of a pixel beside its samples: its own texels, history, the result's store",
+     "B, cycles", "sweeps of the sampling pass"),
+    ("O(n)", "cost of the frame beside: set-up, classification, update, combine, launches",
+     "B, cycles", "sweeps of the other passes"),
+)  # fmt: skip
+
+#: Meaning of each coefficient; `{level}` for each cache.
+COEFFICIENTS = {
+    "l1.asked": "sectors asked by scattered reads / those of random lanes",
+    "l1.lines": "share of the L1's lines that hold what is used",
+    "l1.company": "share of what other tiles of an L1 read that is found there",
+    "{level}.lines": "share of the level's lines that hold what is used",
+    "{level}.passed": "what it passes on / what the model of reuse gives",
+    "cycles.issue": "weight of the time to issue every instruction",
+    "cycles.l1": "weight of the time at the L1's peak",
+    "cycles.l2": "weight of the time at the L2's peak",
+    "cycles.dram": "weight of the time at the memory's peak",
+    "cycles.latency": "cycles of a dependent access that nothing hides",
+}
+
+
+@dataclass(frozen=True)
+class Coefficient:
+    """A fitted number with its 95 % confidence interval."""
+
+    value: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class CostModel:
+    """The coefficients of one GPU. gpu: its preset. frames: how many it was fitted to."""
+
+    gpu: str
+    coefficients: Mapping[str, Coefficient]
+    frames: int
+
+    def value(self, name: str, default: float = 1.0) -> float:
+        """A coefficient's value; `default` where the model has none."""
+        found = self.coefficients.get(name)
+        return default if found is None else found.value
+
+    @property
+    def has_cycles(self) -> bool:
+        return all(f"cycles.{limit}" in self.coefficients for limit in LIMITS)
+
+    def frame(self) -> pd.DataFrame:
+        """One row per coefficient: gpu, coefficient, value, low, high, meaning."""
+        rows = []
+        for name, c in self.coefficients.items():
+            what = name.partition(".")[2]
+            meaning = COEFFICIENTS.get(name) or COEFFICIENTS[f"{{level}}.{what}"]
+            rows.append((self.gpu, name, c.value, c.low, c.high, meaning))
+        return pd.DataFrame(rows, columns=["gpu", "coefficient", "value", "low", "high", "meaning"])
+
+
+def coefficient_names(machine: Machine) -> tuple[str, ...]:
+    """The coefficients that a machine's model has."""
+    names = ["l1.asked", "l1.lines", "l1.company", "l1.passed"]
+    names += [f"{v.name}.{what}" for v in machine.levels[1:] for what in ("lines", "passed")]
+    return (*names, *(f"cycles.{limit}" for limit in LIMITS)) if has_timing(machine) else (*names,)
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """What the model says of a frame.
+
+    lane_fetches, num_samples: of all lanes. demand_bytes: level -> bytes, "dram" last. cycles: None
+    where the model or the preset has none. by_launch: one row per launch: pass, l2_bytes,
+    dram_bytes, cycles.
+    """
+
+    gpu: str
+    workload: str
+    lane_fetches: int
+    num_samples: int
+    demand_bytes: Mapping[str, float]
+    cycles: float | None
+    by_launch: pd.DataFrame
+
+
+class Prepared:
+    """A workload on a machine, with what no coefficient changes."""
+
+    def __init__(self, workload: Workload, machine: Machine) -> None:
+        self.workload, self.machine = workload, machine
+        self.spreads: tuple[ScatterSpread, ...] = tuple(
+            spread_scatter(workload, scatter, machine) for scatter in workload.scatters
+        )
+        none = [l1_misses(s, machine, 1.0, 0.0) for s in self.spreads]
+        frame = build_frame(workload, self.spreads, none, machine, 0.0)
+        self.swept_bytes = frame.l1_swept_bytes
+        self.swept_below = _asked_of_first(frame, machine)
+
+    def l1_bytes(self, model: CostModel) -> float:
+        """Bytes asked of the L1."""
+        sector = self.machine.levels[0].sector_bytes
+        scattered = sum(s.l1_accesses for s in self.spreads) * sector
+        return model.value("l1.asked") * scattered + self.swept_bytes
+
+    def misses(self, model: CostModel) -> list[list[ClassMisses]]:
+        """The L1's misses of the tiles' classes."""
+        lines, company = model.value("l1.lines"), model.value("l1.company")
+        return [l1_misses(s, self.machine, lines, company) for s in self.spreads]
+
+    def asked_below_l1(self, model: CostModel) -> float:
+        """Bytes asked of the level behind the L1."""
+        missed = sum(
+            c.total * c.tile_class.num_tiles for group in self.misses(model) for c in group
+        )
+        sector = self.machine.levels[0].sector_bytes
+        return model.value("l1.passed") * missed * sector + self.swept_below
+
+    def steps(self, model: CostModel) -> Frame:
+        """The frame as it comes to the level behind the L1."""
+        misses = self.misses(model)
+        passed = model.value("l1.passed")
+        return build_frame(self.workload, self.spreads, misses, self.machine, passed)
+
+    def pass_through(
+        self, model: CostModel, frame: Frame, index: int, steps: tuple[Step, ...]
+    ) -> Passed:
+        """A frame's steps through level `index`; from 1, the level behind the L1."""
+        level = self.machine.levels[index]
+        lines, factor = (model.value(f"{level.name}.{what}") for what in ("lines", "passed"))
+        return pass_level(level, frame.size, steps, lines, factor)
+
+
+def _asked_of_first(frame: Frame, machine: Machine) -> float:
+    """Bytes that sweeps ask of the level behind the L1."""
+    level = machine.levels[1]
+    return sum(
+        s.requests_bytes
+        for step in frame.steps
+        for s in step.swept
+        if level.takes_stores or not s.is_store
+    )
+
+
+def predict(workload: Workload, gpu: Gpu, model: CostModel) -> Prediction:
+    """Predict a frame's demand and cycles.
+
+    gpu: the configuration that the model was fitted on, or one like it.
+    """
+    return predict_prepared(Prepared(workload, Machine.of(gpu)), model)
+
+
+def predict_prepared(prepared: Prepared, model: CostModel) -> Prediction:
+    """`predict`, of a workload that is prepared."""
+    workload, machine = prepared.workload, prepared.machine
+    demand = {"l1": prepared.l1_bytes(model)}
+    frame = prepared.steps(model)
+    steps, passed = frame.steps, None
+    l2_asked: Mapping[int, float] = {}
+    for index, level in enumerate(machine.levels[1:], 1):
+        passed = prepared.pass_through(model, frame, index, steps)
+        demand[level.name] = sum(passed.asked.values())
+        if level.name == "l2":
+            l2_asked = passed.asked
+        steps = passed.steps
+    assert passed is not None
+    demand["dram"] = passed.read_bytes + passed.written_bytes
+    cycles: list[float | None] = [None] * len(workload.launches)
+    if has_timing(machine) and model.has_cycles:
+        asked = model.value("l1.asked")
+        times = limit_times(workload, prepared.spreads, machine, asked, l2_asked, passed.moved)
+        weights = {limit: model.value(f"cycles.{limit}") for limit in LIMITS}
+        start = launch_cycles(machine)
+        cycles = [start + sum(weights[k] * time[k] for k in LIMITS) for time in times]
+    rows = [
+        (w.pass_name, l2_asked.get(w.launch, 0.0), passed.moved.get(w.launch, 0.0), c)
+        for w, c in zip(workload.launches, cycles, strict=True)
+    ]
+    columns = ["pass", "l2_bytes", "dram_bytes", "cycles"]
+    known = [c for c in cycles if c is not None]
+    return Prediction(
+        machine.gpu.name,
+        workload.name,
+        workload.lane_fetches,
+        workload.num_samples,
+        demand,
+        float(sum(known)) if known else None,
+        pd.DataFrame(rows, columns=columns).astype({"cycles": "float64"}),
+    )
