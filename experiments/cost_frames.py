@@ -74,6 +74,7 @@ def scene_workload(
         width,
         height,
         optics,
+        tuple(described.values()),
         tuple(maker.scatters),
         tuple(maker.sweeps),
         tuple(maker.launches),
@@ -106,7 +107,7 @@ class _Maker:
     def add(self, step: Step, program: Program) -> None:
         """Take one launch."""
         grid, number = step.grid, len(self.launches)
-        turns, samples, pixels = self._loop(step)
+        turns, samples, pixels, counts = self._loop(step)
         inside = int(np.count_nonzero(grid.inside.any(axis=1)))
         is_level = step.pass_name == "prefilter"
         scattering = np.zeros(grid.num_warps, np.bool_)
@@ -169,7 +170,7 @@ class _Maker:
                     )
                 )
         if loop and step.pass_name in DIRECTIONS:
-            self.scatters.append(self._scatter(step, grid, loop, turns, samples, pixels, number))
+            self.scatters.append(self._scatter(step, grid, loop, counts, number))
         warps = grid.num_warps // grid.num_ctas
         instructions += _issued(program.trailing_arithmetic) * grid.num_warps
         self.launches.append(
@@ -189,14 +190,14 @@ class _Maker:
         """(num_warps, 32) bool: the lanes whose pixels scatter."""
         return grid.gather(self.gbuffer.subsurface).astype(np.bool_) & grid.inside
 
-    def _loop(self, step: Step) -> tuple[Any, Any, Any]:
-        """(num_warps,) turns of the loop; (num_warps,) samples and scattering pixels."""
+    def _loop(self, step: Step) -> tuple[Any, Any, Any, Any]:
+        """(num_warps,) turns of the loop, samples and scattering pixels; (num_warps, 32) counts."""
         from kernels import taa
 
         grid = step.grid
         if step.pass_name == "prefilter":
             none = np.zeros(grid.num_warps, np.int64)
-            return none, none, none
+            return none, none, none, none
         scatters = self._scattering(grid)
         pixels = scatters.sum(axis=1)
         if step.pass_name == "sampling":
@@ -210,23 +211,33 @@ class _Maker:
             }.get(step.pass_name, 0)
             shown = grid.inside if step.pass_name == "taa" else scatters
             counts = np.where(shown, each, 0)
-        return counts.max(axis=1), counts.sum(axis=1), pixels
+        return counts.max(axis=1), counts.sum(axis=1), pixels, counts
+
+    def _read_samples(
+        self, grid: Grid, direction: str, taps: Sequence[float], counts: Any, scale: Any
+    ) -> int:
+        """Samples that are read: a filter's taps beyond the frame are not. scale: (num_warps, 32)
+        texels per mm.
+        """
+        if not taps:
+            return int(counts.sum())
+        vertical = direction == "y"
+        limit = grid.height if vertical else grid.width
+        middle = grid.lanes[1 if vertical else 0] + 0.5
+        inside = 0
+        for tap in taps:
+            at = middle + tap * scale
+            inside += int(np.count_nonzero((counts > 0) & (at >= 0.0) & (at < limit)))
+        return inside
 
     def _scatter(
         self,
         step: Step,
         grid: Grid,
         loop: Sequence[Access],
-        turns: Any,
-        samples: Any,
-        pixels: Any,
+        counts: Any,
         number: int,
     ) -> Scatter:
-        warps = grid.num_warps // grid.num_ctas
-
-        def per_tile(values: Any) -> Any:
-            return values.reshape(-1, warps).sum(axis=1).astype(np.int64)
-
         direction = DIRECTIONS[step.pass_name]
         taps = () if direction == "around" else taps_mm(self.method.as_dict())
         # Facts sheet 2.5: pixels per mm at a depth.
@@ -234,12 +245,12 @@ class _Maker:
         per_mm = step_mm * self.gbuffer.width * self.gbuffer.projection_x
         scatters = self._scattering(grid)
         depth = np.where(scatters, grid.gather(self.gbuffer.depth_cm), 1.0)
-        scale = np.where(scatters, per_mm / depth, 0.0).sum(axis=1)
-        num_pixels = per_tile(pixels)
-        summed = scale.reshape(-1, warps).sum(axis=1)
+        scale = np.where(scatters, per_mm / depth, 0.0)
+        num_pixels = scatters.reshape(grid.num_ctas, -1).sum(axis=1)
+        summed = scale.reshape(grid.num_ctas, -1).sum(axis=1)
         names = list(dict.fromkeys(a.texture for a in loop))
         reads = []
-        for name in sorted(names, key=list(self.textures).index):
+        for name in names:
             texture = self.textures[name]
             bilinear = any(a.footprint == "bilinear" for a in loop if a.texture == name)
             reads.append(Read(name, texture.texel_bytes, texture.num_mips > 1, bilinear))
@@ -249,13 +260,12 @@ class _Maker:
             direction,
             tiles & 0xFFFF,
             tiles >> 16,
-            num_pixels,
-            per_tile(samples),
-            per_tile(turns),
+            counts.reshape(grid.num_ctas, -1).astype(np.int64),
             summed / np.maximum(num_pixels, 1),
             tuple(reads),
             taps,
             number,
+            self._read_samples(grid, direction, taps, counts, scale),
         )
 
 

@@ -9,9 +9,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from cachesim.cost.frame import row_sectors
 from cachesim.cost.machine import Machine
-from cachesim.cost.tiles import ScatterSpread
+from cachesim.cost.memory import Memory
+from cachesim.cost.tiles import ScatterCost
 from cachesim.cost.workload import LaunchWork, Workload
 
 #: The limits, in the order of their coefficients.
@@ -32,29 +32,29 @@ def launch_cycles(machine: Machine) -> int:
 
 def limit_times(
     workload: Workload,
-    spreads: Sequence[ScatterSpread],
+    costs: Sequence[ScatterCost],
     machine: Machine,
-    l1_asked: float,
+    memory: Memory,
     l2_asked: Mapping[int, float],
     dram_moved: Mapping[int, float],
 ) -> list[dict[str, float]]:
     """Per launch, the cycles that each of `LIMITS` alone would take; latency in dependent accesses.
 
-    l1_asked: factor on the sectors asked of the L1. l2_asked, dram_moved: launch -> bytes.
+    l2_asked, dram_moved: launch -> bytes.
     """
     found = []
     for launch in workload.launches:
-        spread = next((s for s in spreads if s.scatter.launch == launch.launch), None)
-        found.append(_of_launch(workload, launch, spread, machine, l1_asked, l2_asked, dram_moved))
+        cost = next((c for c in costs if c.scatter.launch == launch.launch), None)
+        found.append(_of_launch(workload, launch, cost, machine, memory, l2_asked, dram_moved))
     return found
 
 
 def _of_launch(
     workload: Workload,
     launch: LaunchWork,
-    spread: ScatterSpread | None,
+    cost: ScatterCost | None,
     machine: Machine,
-    l1_asked: float,
+    memory: Memory,
     l2_asked: Mapping[int, float],
     dram_moved: Mapping[int, float],
 ) -> dict[str, float]:
@@ -64,18 +64,18 @@ def _of_launch(
     busiest, sectors = 1.0, 0.0
     waves = max(1.0, launch.num_ctas / (gpu.sm.count * machine.resident(launch)))
     accesses = launch.accesses / max(launch.num_ctas * launch.warps_per_cta, 1)
-    if spread is not None and spread.classes:
-        scatter = spread.scatter
+    if cost is not None and cost.classes:
+        scatter = cost.scatter
         total = float(scatter.steps.sum()) * len(scatter.reads)
-        busiest = max(1.0, float(spread.schedule.end.max()) * sms / max(total, 1.0))
-        sectors += l1_asked * spread.l1_accesses
-        working = sum(c.num_tiles for c in spread.classes)
+        busiest = max(1.0, float(cost.schedule.end.max()) * sms / max(total, 1.0))
+        sectors += cost.asked
+        working = sum(len(c.tiles) for c in cost.classes)
         waves = max(1.0, working / (gpu.sm.count * machine.resident(launch)))
-        longest = max(c.turns for c in spread.classes)
+        longest = max(c.turns for c in cost.classes)
         accesses = len(scatter.reads) * longest
     for sweep in (s for s in workload.sweeps if s.launch == launch.launch):
         blocks = sweep.rows * 32.0 / (machine.warp_shape[0] * machine.warp_shape[1])
-        sectors += blocks * row_sectors(sweep, machine, machine.warp_shape)
+        sectors += blocks * memory.row_sectors(sweep, machine.warp_shape)
     l1_rate = gpu.l1_timing.bytes_per_cycle or gpu.l1_timing.num_banks * gpu.l1_timing.bank_bytes
     units = sms * l1.instances / gpu.sm.count
     l2, dram = gpu.l2_timing, gpu.dram_timing

@@ -16,6 +16,9 @@ from numba import njit
 
 from cachesim.cost.workload import Floats, Ints
 
+#: Turns between the ends of CTAs of equal work: their last accesses.
+_BETWEEN_ENDS = 2.0
+
 
 @dataclass(frozen=True, eq=False)
 class Schedule:
@@ -94,12 +97,19 @@ def _dispatch(
             shared[sm, unit] += passed * working[sm, unit]
         now_of[sm] = now
         least = np.inf
+        waiting = False
         for place in range(places):
             cta = cta_at[sm, place]
             if cta < 0:
                 continue
             left[sm, place] -= each
             if left[sm, place] <= 1e-9 * accesses[cta]:
+                if waiting:
+                    # CTAs that are done in one round end one after the other, so that those of
+                    # other SMs come between.
+                    least = 0.0
+                    continue
+                waiting = True
                 unit = place % units
                 end[cta] = now
                 length = now - start[cta]
@@ -120,4 +130,4 @@ def _dispatch(
                     following += 1
             if cta_at[sm, place] >= 0:
                 least = min(least, left[sm, place])
-        next_end[sm] = now + least * held[sm] if held[sm] else np.inf
+        next_end[sm] = now + max(least * held[sm], _BETWEEN_ENDS) if held[sm] else np.inf

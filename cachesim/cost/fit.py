@@ -1,8 +1,7 @@
 """Fitting the cost function's efficiencies to simulated frames, level by level.
 
 What a level passes on is the demand of the next, so that each level's coefficients are fitted to
-the demand behind it, with those above already known: relative differences, least squares. Where the
-frames say nothing of a coefficient, a weak prior keeps it at its start; its interval is wide then.
+the demand behind it, with those above already known: relative differences, least squares.
 The cycles' weights are a non-negative linear fit to the passes' cycles as shares of the frame's.
 """
 
@@ -26,11 +25,8 @@ from cachesim.cost.workload import Floats, Workload
 from cachesim.report import Report
 from traces.errors import InputError
 
-#: Where a fit of lines and company starts, and the bounds of everything but the cycles' weights.
-START = {"l1.lines": 0.8, "l1.company": 0.5}
+#: Bounds of everything but the cycles' weights.
 BOUNDS = (0.02, 50.0)
-#: Weight of the prior beside one frame's relative difference, per factor of e.
-_PRIOR = 0.02
 _DIFFERENCE_STEP = 0.05
 _CONFIDENCE = 0.95
 
@@ -91,10 +87,8 @@ class _Fit:
             self.prepared.append(Prepared(observation.workload, self.machine))
 
     def run(self) -> CostModel:
-        self._fit_level(("l1.asked",), "l1", lambda k, m: self.prepared[k].l1_bytes(m))
         second = self.machine.levels[1].name
-        names = ("l1.lines", "l1.company", "l1.passed")
-        self._fit_level(names, second, lambda k, m: self.prepared[k].asked_below_l1(m))
+        self._fit_level("l1.passed", second, lambda k, m: self.prepared[k].asked_below_l1(m))
         self.progress(0.5)
         frames = [p.steps(self.model) for p in self.prepared]
         steps = [frame.steps for frame in frames]
@@ -129,47 +123,28 @@ class _Fit:
 
         name = levels[index].name
         behind = "dram" if following is None else following.name
-        self._fit_level((f"{name}.lines", f"{name}.passed"), behind, demand)
+        self._fit_level(f"{name}.passed", behind, demand)
         return [pass_on(k, self.model) for k in range(len(self.prepared))]
 
-    def _with(self, names: Sequence[str], logs: Floats) -> CostModel:
-        values = {n: Coefficient(v, v, v) for n, v in zip(names, np.exp(logs), strict=True)}
-        known = {**self.model.coefficients, **values}
-        return replace(self.model, coefficients=known)
-
-    def _fit_level(
-        self, names: Sequence[str], level: str, asked: Callable[[int, CostModel], float]
-    ) -> None:
-        """Fit coefficients to the demand of a level."""
+    def _fit_level(self, name: str, level: str, asked: Callable[[int, CostModel], float]) -> None:
+        """Fit a coefficient to the demand of a level."""
         observed = np.array([o.demand_bytes[level] for o in self.observations])
-        start = np.log([START.get(name, 1.0) for name in names])
 
-        def differences(shifted: Floats) -> Floats:
-            logs = start + shifted - 1.0
-            model = self._with(names, logs)
+        def differences(value: Floats) -> Floats:
+            known = {**self.model.coefficients, name: Coefficient(*[float(value[0])] * 3)}
+            model = replace(self.model, coefficients=known)
             found = np.array([asked(k, model) for k in range(len(observed))])
-            relative = found / np.maximum(observed, 1.0) - 1.0
-            return np.concatenate([relative, _PRIOR * (logs - start)])
+            return found / np.maximum(observed, 1.0) - 1.0
 
-        # The solver's steps are relative to the variables: these are 1 at the start.
-        limits = np.log(BOUNDS)[:, None] - start + 1.0
         solved = least_squares(
-            differences,
-            np.ones(len(names)),
-            bounds=(limits[0], limits[1]),
-            diff_step=_DIFFERENCE_STEP,
-            xtol=1e-3,
-            ftol=1e-3,
-            max_nfev=12,
-        )
-        spread = _spread(solved.jac, solved.fun, len(observed))
-        known = dict(self.model.coefficients)
-        for name, log, width in zip(names, start + solved.x - 1.0, spread, strict=True):
-            low, value, high = (
-                float(np.exp(np.clip(log + s * width, *np.log(BOUNDS)))) for s in (-1, 0, 1)
-            )
-            known[name] = Coefficient(value, low, high)
-        self.model = replace(self.model, coefficients=known)
+            differences, np.ones(1), bounds=BOUNDS, diff_step=_DIFFERENCE_STEP, xtol=1e-3,
+            ftol=1e-4, max_nfev=8,
+        )  # fmt: skip
+        (half,) = _spread(solved.jac, solved.fun, len(observed))
+        value = float(solved.x[0])
+        low, high = (float(np.clip(value + s * half, *BOUNDS)) for s in (-1, 1))
+        fitted = {**self.model.coefficients, name: Coefficient(value, low, high)}
+        self.model = replace(self.model, coefficients=fitted)
 
     def _fit_cycles(
         self, l2_asked: Sequence[Mapping[int, float]], moved: Sequence[Mapping[int, float]]
@@ -177,7 +152,7 @@ class _Fit:
         """Fit the weights of the limits to the cycles of the passes."""
         rows: list[list[float]] = []
         wanted: list[float] = []
-        start, asked = launch_cycles(self.machine), self.model.value("l1.asked")
+        start = launch_cycles(self.machine)
         for k, observation in enumerate(self.observations):
             if not observation.pass_cycles:
                 continue
@@ -185,9 +160,9 @@ class _Fit:
             launches = observation.workload.launches
             times = limit_times(
                 observation.workload,
-                self.prepared[k].spreads,
+                self.prepared[k].costs,
                 self.machine,
-                asked,
+                self.prepared[k].memory,
                 l2_asked[k],
                 moved[k],
             )

@@ -12,9 +12,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from cachesim.cost.footprint import Rings, granule_texels
 from cachesim.cost.machine import Machine
-from cachesim.cost.tiles import ClassMisses, ScatterSpread
+from cachesim.cost.memory import Memory
+from cachesim.cost.tiles import ScatterCost
 from cachesim.cost.workload import TILE_SIDE, Floats, Ints, Sweep, Workload
 
 MAX_CELLS_ACROSS = 24
@@ -85,49 +85,36 @@ class Cells:
         return np.repeat(covered, self.across)
 
 
-def row_sectors(sweep: Sweep, machine: Machine, block: tuple[int, int]) -> float:
-    """Sectors that the lanes of a block of pixels ask for in a sweep, all of them active."""
-    layout, sector = machine.gpu.texture_layout, machine.levels[0].sector_bytes
-    wide, tall = granule_texels(layout, sweep.texel_bytes, sector)
-    if not sweep.bilinear:
-        return max(1.0, block[0] / wide) * max(1.0, block[1] / tall)
-    if sweep.pass_name == "prefilter":
-        # A destination texel reads four texels of the finer level.
-        return max(1.0, 2 * block[0] / wide) * max(1.0, 2 * block[1] / tall)
-    return (block[0] / wide + 1.0) * (block[1] / tall + 1.0)
-
-
-def _asked_bytes(sweep: Sweep, machine: Machine, block: tuple[int, int]) -> float:
+def asked_bytes(sweep: Sweep, memory: Memory, block: tuple[int, int]) -> float:
     """Bytes of the sectors that a sweep asks for, a block at a time. Where a row has only some of
     its lanes, it asks for a part of its sectors.
     """
     blocks = sweep.rows * 32.0 / (block[0] * block[1])
     filled = min(1.0, sweep.lane_fetches / (32.0 * sweep.rows))
-    sectors = row_sectors(sweep, machine, block) * float(np.sqrt(filled))
-    return blocks * sectors * machine.levels[0].sector_bytes
+    sectors = memory.row_sectors(sweep, block) * float(np.sqrt(filled))
+    return blocks * sectors * memory.sector_bytes
 
 
 def build_frame(
     workload: Workload,
-    spreads: Sequence[ScatterSpread],
-    misses: Sequence[Sequence[ClassMisses]],
+    costs: Sequence[ScatterCost],
     machine: Machine,
-    passed: float,
+    memory: Memory,
+    passed: float = 1.0,
 ) -> Frame:
     """The steps of a frame on a machine.
 
-    spreads, misses: of the workload's scatters. passed: factor on the scattered misses.
+    costs: of the workload's scatters. passed: factor on the scattered misses.
     """
     cells = Cells(workload)
     fields: dict[tuple[str, int], int] = {}
     sizes: list[float] = []
 
-    def field_of(texture: str, mip: int, texel_bytes: int) -> int:
+    def field_of(texture: str, mip: int) -> int:
         key = texture, mip
         if key not in fields:
             fields[key] = len(fields)
-            texels = max(1, workload.width >> mip) * max(1, workload.height >> mip)
-            sizes.append(float(texels * texel_bytes))
+            sizes.append(memory.level_bytes(texture, mip))
         return fields[key]
 
     scattering = np.zeros(cells.num)
@@ -137,24 +124,22 @@ def build_frame(
     steps: list[Step] = []
     l1_swept = 0.0
     for launch in workload.launches:
-        spread = next((s for s in spreads if s.scatter.launch == launch.launch), None)
-        num_steps = SWEEP_STEPS if spread is None else SCATTER_STEPS
+        cost = next((c for c in costs if c.scatter.launch == launch.launch), None)
+        num_steps = SWEEP_STEPS if cost is None else SCATTER_STEPS
         held = [Step(launch.launch) for _ in range(num_steps)]
-        if spread is not None:
-            by_class = misses[list(spreads).index(spread)]
-            texel = {r.texture: r.texel_bytes for r in spread.scatter.reads}
+        if cost is not None:
             for part in (None, *machine.looked_at()):
                 for step in held if part is not None else ():
                     step.parts.append({})
-                found = _arrivals(spread, by_class, machine, cells, part)
+                found = _arrivals(cost, machine, cells, part)
                 for (texture, level), arrivals in found.items():
-                    index = field_of(texture, level, texel[texture])
+                    index = field_of(texture, level)
                     for step, bytes_there in zip(held, arrivals, strict=True):
                         kept = step.scattered if part is None else step.parts[-1]
                         kept[index] = passed * bytes_there
         for sweep in (s for s in workload.sweeps if s.launch == launch.launch):
-            index = field_of(sweep.texture, sweep.mip, sweep.texel_bytes)
-            l1_swept += _add_sweep(sweep, index, sizes[index], held, cells, scattering, machine)
+            index = field_of(sweep.texture, sweep.mip)
+            l1_swept += _add_sweep(sweep, index, sizes[index], held, cells, scattering, machine, memory)
         steps += held
     return Frame(np.outer(sizes, cells.share), tuple(steps), l1_swept)
 
@@ -167,12 +152,13 @@ def _add_sweep(
     cells: Cells,
     scattering: Floats,
     machine: Machine,
+    memory: Memory,
 ) -> float:
     """Put a sweep into the steps of its launch; the bytes that it asks of the L1."""
-    asked = _asked_bytes(sweep, machine, machine.warp_shape)
+    asked = asked_bytes(sweep, memory, machine.warp_shape)
     is_store = sweep.operation != "load"
     # Warps of a CTA share what they read; stores pass one by one.
-    requests = asked if is_store else _asked_bytes(sweep, machine, (TILE_SIDE, TILE_SIDE))
+    requests = asked if is_store else asked_bytes(sweep, memory, (TILE_SIDE, TILE_SIDE))
     everywhere = sweep.lane_fetches >= 0.98 * min(sweep.width * sweep.height, 32 * sweep.rows)
     everywhere = everywhere and sweep.lane_fetches >= 0.2 * sweep.width * sweep.height
     where = cells.share if everywhere or not scattering.any() else scattering / scattering.sum()
@@ -187,20 +173,19 @@ def _add_sweep(
 
 
 def _arrivals(
-    spread: ScatterSpread,
-    misses: Sequence[ClassMisses],
+    cost: ScatterCost,
     machine: Machine,
     cells: Cells,
     part: range | None,
 ) -> dict[tuple[str, int], Floats]:
     """(texture, level) -> (steps, cells) bytes that miss the L1s, or those of some units alone."""
-    plan, scatter = spread.schedule, spread.scatter
+    plan, scatter = cost.schedule, cost.scatter
     finish = float(plan.end.max()) or 1.0
     edges = np.linspace(0.0, finish, SCATTER_STEPS + 1)
     shape = (2 * cells.down, 2 * cells.across)
     found: dict[tuple[str, int], Floats] = {}
-    for of_class in misses:
-        tiles = of_class.tile_class.tiles
+    for of_class in cost.classes:
+        tiles = of_class.tiles
         if part is not None:
             units = plan.unit[tiles]
             tiles = tiles[(units >= part.start) & (units < part.stop)]
@@ -215,12 +200,12 @@ def _arrivals(
             there = np.bincount(at, weight, cells.num).reshape(cells.down, cells.across)
             sources[k, : cells.down, : cells.across] = there
         moved = np.fft.rfft2(sources)
-        for read in of_class.tile_class.reads:
-            for level, missed in enumerate(of_class.by_read[read.texture]):
+        for read, by_level in zip(scatter.reads, of_class.missed / len(of_class.tiles), strict=True):
+            for level, missed in enumerate(by_level):
                 total = float(missed.sum()) * machine.levels[0].sector_bytes
                 if total <= 0.0:
                     continue
-                kernel = np.fft.rfft2(_kernel(read.rings, missed, cells, shape))
+                kernel = np.fft.rfft2(_kernel(cost.edges, missed, cells, shape, scatter.direction))
                 spread_out = np.fft.irfft2(moved * kernel, s=shape)[:, : cells.down, : cells.across]
                 spread_out = np.maximum(spread_out, 0.0).reshape(SCATTER_STEPS, -1)
                 weights = sources.sum(axis=(1, 2))
@@ -231,12 +216,16 @@ def _arrivals(
     return found
 
 
-def _kernel(rings: Rings, weight: Floats, cells: Cells, shape: tuple[int, int]) -> Floats:
+def _kernel(
+    edges: Floats, weight: Floats, cells: Cells, shape: tuple[int, int], direction: str
+) -> Floats:
     """Share of a tile's misses by how many cells they lie away, wrapped as FFTs have it."""
     turn = np.arange(_RING_POINTS)
     angle = 2.0 * np.pi * (turn * 0.6180339887498949 % 1.0)
+    if direction != "around":
+        angle = np.pi * (turn % 2 + (0.5 if direction == "y" else 0.0))
     part = (turn + 0.5) / _RING_POINTS
-    inner, outer = rings.radius[:-1, None] ** 2, rings.radius[1:, None] ** 2
+    inner, outer = edges[:-1, None] ** 2, edges[1:, None] ** 2
     radius = np.sqrt(inner + (outer - inner) * part)
     # The tile lies anywhere in its cell.
     within_x, within_y = turn * 0.7548776662466927 % 1.0, turn * 0.5698402909980532 % 1.0

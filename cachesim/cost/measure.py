@@ -73,6 +73,7 @@ def measure_workload(trace: Trace, where: str = "trace") -> Workload:
         width,
         height,
         optics,
+        trace.textures,
         scatters,
         tuple(sweep for launch in measured for sweep in launch.sweeps()),
         tuple(launch.work() for launch in measured),
@@ -85,9 +86,7 @@ class _Tiles:
 
     x: Ints
     y: Ints
-    pixels: Ints
-    samples: Ints
-    steps: Ints
+    counts: Ints
     distance: Floats
 
 
@@ -144,11 +143,8 @@ class _Launch:
         warps_per_cta = self.trace.launches[self.index].warps_per_cta
         cta, num_ctas = warp // warps_per_cta, chunk.num_warps // warps_per_cta
         counted = np.flatnonzero(np.isin(index, self._counted()))
-        samples = active[counted].sum(axis=1)
-        # The pixels that scatter are those of a warp's first turn.
-        first = np.ones(len(counted), np.bool_)
-        first[1:] = warp[counted][1:] != warp[counted][:-1]
-        turns = np.bincount(cta[counted], minlength=num_ctas)
+        turns = np.zeros((chunk.num_warps, lanes.shape[1]), np.int64)
+        np.add.at(turns, warp[counted], active[counted])
         inside = (own != INACTIVE_TEXEL).reshape(num_ctas, -1)
         lane = inside.argmax(axis=1)
         pixel = own.reshape(num_ctas, -1)[np.arange(num_ctas), lane].astype(np.int64)
@@ -158,9 +154,7 @@ class _Launch:
             _Tiles(
                 np.where(on_screen, (pixel & side) // TILE_SIDE, 0),
                 np.where(on_screen, (pixel >> _SIDE_BITS & side) // TILE_SIDE, 0),
-                np.bincount(cta[counted][first], samples[first], num_ctas).astype(np.int64),
-                np.bincount(cta[counted], samples, num_ctas).astype(np.int64),
-                turns.astype(np.int64),
+                turns.reshape(num_ctas, -1),
                 self._distances(cta[counted], dx[counted], dy[counted], active[counted], num_ctas),
             )
         )
@@ -215,15 +209,15 @@ class _Launch:
             return None
         joined = {
             name: np.concatenate([getattr(t, name) for t in self.tiles])
-            for name in ("x", "y", "pixels", "samples", "steps", "distance")
+            for name in ("x", "y", "counts", "distance")
         }
-        direction = DIRECTIONS[self.pass_name]
+        direction, counts = DIRECTIONS[self.pass_name], joined["counts"]
         taps = () if direction == "around" else taps_mm(method)
         if taps:
             scale = joined["distance"][:, 0] / np.mean(np.abs(taps))
         else:
             scale = self._find_scales(optics, joined)
-        textures = sorted({self.trace.instructions[i].texture for i in self.loop})
+        textures = dict.fromkeys(self.trace.instructions[i].texture for i in sorted(self.loop))
         described = [(self.trace.textures[t], t) for t in textures]
         reads = tuple(
             Read(
@@ -243,13 +237,12 @@ class _Launch:
             direction,
             joined["x"],
             joined["y"],
-            joined["pixels"],
-            joined["samples"],
-            joined["steps"],
-            np.where(joined["pixels"] > 0, scale, 0.0),
+            np.where(counts > 0, len(taps), 0) if taps else counts,
+            np.where(counts.any(axis=1), scale, 0.0),
             reads,
             taps,
             self.index,
+            int(counts.sum()),
         )
 
     def _find_scales(self, optics: Optics, tiles: dict[str, Any]) -> Floats:
@@ -268,7 +261,7 @@ class _Launch:
         )
         x, y = (tiles[k] * TILE_SIDE + TILE_SIDE / 2 for k in "xy")
         room = np.minimum(np.minimum(x, self.width - x), np.minimum(y, self.height - y))
-        scatters = tiles["pixels"] > 0
+        scatters = tiles["counts"].any(axis=1)
         clamped = scatters & (room < TILE_SIDE / 2 + np.where(is_far, 1.2 * distance[:, 1], 0.0))
         sound = np.flatnonzero(scatters & ~clamped)
         if len(sound):

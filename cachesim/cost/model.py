@@ -29,7 +29,8 @@ from cachesim.config import Gpu
 from cachesim.cost.cycles import LIMITS, has_timing, launch_cycles, limit_times
 from cachesim.cost.frame import Frame, Step, build_frame
 from cachesim.cost.machine import Machine
-from cachesim.cost.tiles import ClassMisses, ScatterSpread, l1_misses, spread_scatter
+from cachesim.cost.memory import Memory
+from cachesim.cost.tiles import ScatterCost, cost_scatter
 from cachesim.cost.window import Passed, pass_level
 from cachesim.cost.workload import Workload
 
@@ -66,10 +67,6 @@ SYMBOLS = (
 
 #: Meaning of each coefficient; `{level}` for each cache.
 COEFFICIENTS = {
-    "l1.asked": "sectors asked by scattered reads / those of random lanes",
-    "l1.lines": "share of the L1's lines that hold what is used",
-    "l1.company": "share of what other tiles of an L1 read that is found there",
-    "{level}.lines": "share of the level's lines that hold what is used",
     "{level}.passed": "what it passes on / what the model of reuse gives",
     "cycles.issue": "weight of the time to issue every instruction",
     "cycles.l1": "weight of the time at the L1's peak",
@@ -117,8 +114,7 @@ class CostModel:
 
 def coefficient_names(machine: Machine) -> tuple[str, ...]:
     """The coefficients that a machine's model has."""
-    names = ["l1.asked", "l1.lines", "l1.company", "l1.passed"]
-    names += [f"{v.name}.{what}" for v in machine.levels[1:] for what in ("lines", "passed")]
+    names = [f"{v.name}.passed" for v in machine.levels]
     return (*names, *(f"cycles.{limit}" for limit in LIMITS)) if has_timing(machine) else (*names,)
 
 
@@ -145,46 +141,32 @@ class Prepared:
 
     def __init__(self, workload: Workload, machine: Machine) -> None:
         self.workload, self.machine = workload, machine
-        self.spreads: tuple[ScatterSpread, ...] = tuple(
-            spread_scatter(workload, scatter, machine) for scatter in workload.scatters
+        self.memory = Memory.of(workload, machine)
+        self.costs: tuple[ScatterCost, ...] = tuple(
+            cost_scatter(workload, scatter, machine, self.memory) for scatter in workload.scatters
         )
-        none = [l1_misses(s, machine, 1.0, 0.0) for s in self.spreads]
-        frame = build_frame(workload, self.spreads, none, machine, 0.0)
-        self.swept_bytes = frame.l1_swept_bytes
+        sector = self.memory.sector_bytes
+        frame = build_frame(workload, self.costs, machine, self.memory, 0.0)
+        #: Bytes asked of the L1.
+        self.l1_bytes = sum(c.asked for c in self.costs) * sector + frame.l1_swept_bytes
+        self.missed_bytes = sum(c.missed for c in self.costs) * sector
         self.swept_below = _asked_of_first(frame, machine)
-
-    def l1_bytes(self, model: CostModel) -> float:
-        """Bytes asked of the L1."""
-        sector = self.machine.levels[0].sector_bytes
-        scattered = sum(s.l1_accesses for s in self.spreads) * sector
-        return model.value("l1.asked") * scattered + self.swept_bytes
-
-    def misses(self, model: CostModel) -> list[list[ClassMisses]]:
-        """The L1's misses of the tiles' classes."""
-        lines, company = model.value("l1.lines"), model.value("l1.company")
-        return [l1_misses(s, self.machine, lines, company) for s in self.spreads]
 
     def asked_below_l1(self, model: CostModel) -> float:
         """Bytes asked of the level behind the L1."""
-        missed = sum(
-            c.total * c.tile_class.num_tiles for group in self.misses(model) for c in group
-        )
-        sector = self.machine.levels[0].sector_bytes
-        return model.value("l1.passed") * missed * sector + self.swept_below
+        return model.value("l1.passed") * self.missed_bytes + self.swept_below
 
     def steps(self, model: CostModel) -> Frame:
         """The frame as it comes to the level behind the L1."""
-        misses = self.misses(model)
         passed = model.value("l1.passed")
-        return build_frame(self.workload, self.spreads, misses, self.machine, passed)
+        return build_frame(self.workload, self.costs, self.machine, self.memory, passed)
 
     def pass_through(
         self, model: CostModel, frame: Frame, index: int, steps: tuple[Step, ...]
     ) -> Passed:
         """A frame's steps through level `index`; from 1, the level behind the L1."""
         level = self.machine.levels[index]
-        lines, factor = (model.value(f"{level.name}.{what}") for what in ("lines", "passed"))
-        return pass_level(level, frame.size, steps, lines, factor)
+        return pass_level(level, frame.size, steps, 1.0, model.value(f"{level.name}.passed"))
 
 
 def _asked_of_first(frame: Frame, machine: Machine) -> float:
@@ -209,7 +191,7 @@ def predict(workload: Workload, gpu: Gpu, model: CostModel) -> Prediction:
 def predict_prepared(prepared: Prepared, model: CostModel) -> Prediction:
     """`predict`, of a workload that is prepared."""
     workload, machine = prepared.workload, prepared.machine
-    demand = {"l1": prepared.l1_bytes(model)}
+    demand = {"l1": prepared.l1_bytes}
     frame = prepared.steps(model)
     steps, passed = frame.steps, None
     l2_asked: Mapping[int, float] = {}
@@ -223,8 +205,9 @@ def predict_prepared(prepared: Prepared, model: CostModel) -> Prediction:
     demand["dram"] = passed.read_bytes + passed.written_bytes
     cycles: list[float | None] = [None] * len(workload.launches)
     if has_timing(machine) and model.has_cycles:
-        asked = model.value("l1.asked")
-        times = limit_times(workload, prepared.spreads, machine, asked, l2_asked, passed.moved)
+        times = limit_times(
+            workload, prepared.costs, machine, prepared.memory, l2_asked, passed.moved
+        )
         weights = {limit: model.value(f"cycles.{limit}") for limit in LIMITS}
         start = launch_cycles(machine)
         cycles = [start + sum(weights[k] * time[k] for k in LIMITS) for time in times]

@@ -9,15 +9,29 @@ tiles find each other's samples where they run at about the same time.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from cachesim.cost.footprint import miss_probability
 from cachesim.cost.frame import Step, Swept
 from cachesim.cost.machine import LevelOfCost
 from cachesim.cost.workload import Floats
 
 _SEARCH_STEPS = 7
+_EXPONENT_MAX = 700.0
+
+
+def miss_probability(x: Any, sectors_per_line: int) -> Any:
+    """Probability that a read misses where each sector of the line gets x reads, on average, in the
+    time T that an untouched line stays.
+
+    A line's life has k reads with probability p^(k - 1) (1 - p), p = 1 - exp(-g x), of which the
+    first of each of its g sectors misses. T follows from the cache being full [Che, Tung, Wang
+    2002].
+    """
+    g = sectors_per_line
+    ends = np.exp(-np.minimum(g * x, _EXPONENT_MAX))
+    return g * ends / (1.0 + (g - 1) * ends)
 
 
 @dataclass(frozen=True)

@@ -11,12 +11,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from traces.errors import InputError
+from traces.texture import WARP_SIZE, Texture
 
 TILE_SIDE = 8
 #: Facts sheet 2.3: the constant of the approximate inverse cdf.
@@ -116,27 +118,41 @@ class Scatter:
 
     pass_name: "sampling", "pilot", "separable_h" or "separable_v". direction: "around", or "x" or
     "y" of a filter along a line. tile_x, tile_y: (n,), in the order of the CTAs, empty tiles
-    included. pixels: (n,) that scatter. samples: (n,) of all of them: m' summed. steps: (n,) turns
-    of the loop, summed over the tile's warps. texels_per_mm: (n,), 0 where nothing scatters. reads:
-    of each sample. taps_mm: distances of a filter's taps; () for sampling. launch: its number in
-    the frame.
+    included. counts: (n, 64) m' of each pixel, row by row; 0 where it does not scatter. A filter's
+    taps beyond the frame are counted here, and not in `num_samples`, since it does not read there.
+    texels_per_mm: (n,), 0 where nothing scatters. reads: of each sample, in order. taps_mm:
+    distances of a filter's taps, in order; () for sampling. launch: its number in the frame.
     """
 
     pass_name: str
     direction: str
     tile_x: Ints
     tile_y: Ints
-    pixels: Ints
-    samples: Ints
-    steps: Ints
+    counts: Ints
     texels_per_mm: Floats
     reads: tuple[Read, ...]
     taps_mm: tuple[float, ...]
     launch: int
+    num_samples: int
 
-    @property
-    def num_samples(self) -> int:
-        return int(self.samples.sum())
+    @cached_property
+    def pixels(self) -> Ints:
+        """(n,) pixels that scatter."""
+        found: Ints = np.count_nonzero(self.counts, axis=1)
+        return found
+
+    @cached_property
+    def samples(self) -> Ints:
+        """(n,) samples of all pixels of a tile."""
+        found: Ints = self.counts.sum(axis=1, dtype=np.int64)
+        return found
+
+    @cached_property
+    def steps(self) -> Ints:
+        """(n,) turns of the loop, summed over the tile's warps."""
+        by_warp = self.counts.reshape(len(self.counts), -1, WARP_SIZE).max(axis=2, initial=0)
+        found: Ints = by_warp.sum(axis=1, dtype=np.int64)
+        return found
 
 
 @dataclass(frozen=True)
@@ -178,12 +194,15 @@ class LaunchWork:
 
 @dataclass(frozen=True, eq=False)
 class Workload:
-    """A frame as the cost function sees it. name: for messages and tables."""
+    """A frame as the cost function sees it. name: for messages and tables. textures: all that it
+    reads or writes, in the order in which they lie in memory.
+    """
 
     name: str
     width: int
     height: int
     optics: Optics
+    textures: tuple[Texture, ...]
     scatters: tuple[Scatter, ...]
     sweeps: tuple[Sweep, ...]
     launches: tuple[LaunchWork, ...]

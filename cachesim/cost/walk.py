@@ -1,0 +1,271 @@
+"""R(d), drawn: made-up samples of a few tiles, and which of their sectors one L1 holds.
+
+The distance and direction of each sample are random, as the profile has them; its mip follows by Eq
+5.12, its texel by the lane's pixel, its sector by the layout. Warps of the tiles that an SM holds
+take turns, one access each, as in the counting model; the L1 has the sets, ways and sectors of the
+configuration and replaces the least recently used line. What is counted is by the tile's class, the
+texture, the level and the distance.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit
+
+MAX_LEVELS = 6
+
+
+class Rule(NamedTuple):
+    """How a distance becomes a level. kind: 0 none, 1 Eq 5.12, 2 the textbook's. c: of the
+    approximate inverse cdf. damping: of Eq 5.12, with the frame's size and the mean free path.
+    """
+
+    kind: int
+    d_mm: float
+    c: float
+    damping: float
+    num_levels: int
+
+
+class Tiles(NamedTuple):
+    """The tiles of a window. x, y: (n,) of the first pixel. count: (n, 64) samples of each pixel.
+    scale: (n,) texels per mm. start: (n,) of the profile's cdf, which lies in the own pixel. group:
+    (n,) class.
+    """
+
+    x: npt.NDArray[np.int64]
+    y: npt.NDArray[np.int64]
+    count: npt.NDArray[np.int64]
+    scale: npt.NDArray[np.float64]
+    start: npt.NDArray[np.float64]
+    group: npt.NDArray[np.int64]
+
+
+class Reads(NamedTuple):
+    """What each sample reads, R textures; the tables are those of `AddressMap`, from the first byte
+    that is placed. follows: (R,) at the sample's level. corners: (R,) 4 where bilinear, else 1.
+    """
+
+    x_tables: npt.NDArray[np.uint32]
+    y_tables: npt.NDArray[np.uint32]
+    x_start: npt.NDArray[np.int64]
+    y_start: npt.NDArray[np.int64]
+    base: npt.NDArray[np.int64]
+    low_mask: npt.NDArray[np.uint32]
+    width: npt.NDArray[np.int64]
+    height: npt.NDArray[np.int64]
+    follows: npt.NDArray[np.bool_]
+    corners: npt.NDArray[np.int64]
+
+
+class Cache(NamedTuple):
+    """The L1 units of an SM. valid: (units, lines) bits of sectors, 0 where absent. newer, older:
+    (units, lines + sets) doubly linked lists, a set's own entry behind the lines. held: (units,
+    sets). asked_at: (sectors,) the access that asked last.
+    """
+
+    set_of: npt.NDArray[np.uint32]
+    ways: int
+    sectors_per_line: int
+    sector_bytes: int
+    valid: npt.NDArray[np.uint8]
+    newer: npt.NDArray[np.int32]
+    older: npt.NDArray[np.int32]
+    held: npt.NDArray[np.int32]
+    asked_at: npt.NDArray[np.int64]
+
+
+class Counts(NamedTuple):
+    """(classes, textures, levels, rings) int64 each: reads of lanes, sectors asked of the L1, and
+    missed. drawn: (classes,) samples, those beyond the frame too that a filter does not read.
+    """
+
+    drawn: npt.NDArray[np.int64]
+    lanes: npt.NDArray[np.int64]
+    asked: npt.NDArray[np.int64]
+    missed: npt.NDArray[np.int64]
+
+
+@njit(cache=True, nogil=True)
+def _look_up(cache: Any, unit: Any, line: Any, sector: Any) -> bool:
+    """Look up a sector, and fetch it where it is missing; whether it was there."""
+    bit = np.uint8(1 << sector)
+    num_lines = cache.valid.shape[1]
+    newer, older, own = cache.newer[unit], cache.older[unit], num_lines + cache.set_of[line]
+    was = cache.valid[unit, line]
+    if was:
+        newer[older[line]], older[newer[line]] = newer[line], older[line]
+    elif cache.held[unit, cache.set_of[line]] == cache.ways:
+        victim = newer[own]
+        newer[own], older[newer[victim]] = newer[victim], own
+        cache.valid[unit, victim] = 0
+    else:
+        cache.held[unit, cache.set_of[line]] += 1
+    # The set's entry stands between its newest line and its oldest.
+    newest = older[own]
+    newer[newest], older[line], newer[line], older[own] = line, newest, own, line
+    cache.valid[unit, line] = was | bit
+    return bool(was & bit)
+
+
+@njit(cache=True, nogil=True)
+def _sample(
+    tiles: Any, tile: Any, lane: Any, rule: Any, taps: Any, turn: Any, axis: Any, size: Any, out: Any
+) -> bool:
+    """Place a lane's sample: x, y in texels, level and distance into `out`; whether it is read."""
+    x = tiles.x[tile] + lane % 8 + 0.5
+    y = tiles.y[tile] + lane // 8 + 0.5
+    scale = tiles.scale[tile]
+    if axis:
+        # A filter's tap reads nothing beyond the frame; a bilinear read begins half a texel before.
+        away = taps[turn] * scale
+        along = (x if axis == 1 else y) + away
+        limit = size[0] if axis == 1 else size[1]
+        if along < 0.0 or along >= limit:
+            return False
+        along = min(max(along, 0.5), limit - 0.5) - 0.5
+        out[0], out[1] = (along, y - 0.5) if axis == 1 else (x - 0.5, along)
+        out[2], out[3] = 0.0, abs(away)
+        return True
+    start = tiles.start[tile]
+    xi = min(start + np.random.random() * (1.0 - start), 1.0 - 2.0**-24)
+    r = max(rule.d_mm * ((2.0 - rule.c) * xi - 2.0) * np.log1p(-xi), 1e-5)
+    turned = 2.0 * np.pi * np.random.random()
+    reach = r * scale
+    out[0] = min(max(x + reach * np.cos(turned), 0.5), size[0] - 0.5)
+    out[1] = min(max(y + reach * np.sin(turned), 0.5), size[1] - 0.5)
+    out[3] = reach
+    level = 0
+    if rule.kind:
+        far = np.exp(-r / (3.0 * rule.d_mm))
+        q = max((far * far * far + far) / (4.0 * rule.d_mm), 1e-5)
+        q *= rule.damping * tiles.count[tile, lane] / (scale * scale)
+        if rule.kind == 2:
+            q /= r
+        while level < 5 and q < 4.0**-level:
+            level += 1
+        level = min(level, rule.num_levels - 1)
+    out[2] = level
+    return True
+
+
+@njit(cache=True, nogil=True)
+def walk(
+    tiles: Any,
+    reads: Any,
+    rule: Any,
+    taps: Any,
+    axis: Any,
+    cache: Any,
+    places: Any,
+    warp_size: Any,
+    edges: Any,
+    warm: Any,
+    to_end: Any,
+    seed: Any,
+    access: Any,
+    counts: Any,
+) -> Any:
+    """Take the tiles of one SM, in order, through its L1.
+
+    taps: (T,) mm of a filter, along `axis` 1 (x) or 2 (y); 0 samples around. places: tiles held at
+    a time. edges: (rings + 1,) texels. warm: whether to count only once the L1 has been filled
+    or all first tiles have left. to_end: count until the last tile ends, else until none
+    is waiting. access: number of the first access, above all earlier ones. Returns that of the
+    next. Adds to `counts`.
+    """
+    np.random.seed(seed)
+    n = len(tiles.x)
+    warps = 64 // warp_size
+    num_reads, units = len(reads.follows), cache.valid.shape[0]
+    size = np.array([reads.width[0, 0], reads.height[0, 0]], np.float64)
+    tile_at = np.full(places, -1, np.int64)
+    turn = np.zeros((places, warps), np.int64)
+    turns = np.zeros((places, warps), np.int64)
+    read = np.zeros((places, warps), np.int64)
+    active = np.zeros((places, warps, warp_size), np.bool_)
+    sample = np.zeros((places, warps, warp_size, 4))
+    ring = np.zeros((places, warps, warp_size), np.int64)
+    following, filled, replaced = 0, 0, 0
+    lines = min(len(cache.set_of), cache.ways * cache.held.shape[1]) * units
+    enough = 3 * lines if warm else 0
+    num_rings = len(edges) - 1
+    while True:
+        running = 0
+        for place in range(places):
+            tile = tile_at[place]
+            if tile < 0:
+                if following >= n:
+                    continue
+                tile = tile_at[place] = following
+                replaced += following >= places
+                following += 1
+                for w in range(warps):
+                    turn[place, w], read[place, w] = 0, 0
+                    turns[place, w] = tiles.count[tile, w * warp_size : (w + 1) * warp_size].max()
+            running += 1
+            unit = place % units
+            counting = filled >= enough or replaced >= places
+            left = warps
+            for w in range(warps):
+                if turn[place, w] >= turns[place, w]:
+                    left -= 1
+                    continue
+                k = read[place, w]
+                if k == 0:
+                    for lane in range(warp_size):
+                        pixel = w * warp_size + lane
+                        active[place, w, lane] = turn[place, w] < tiles.count[tile, pixel]
+                        if active[place, w, lane]:
+                            if counting:
+                                counts.drawn[tiles.group[tile]] += 1
+                            out = sample[place, w, lane]
+                            active[place, w, lane] = _sample(
+                                tiles, tile, pixel, rule, taps, turn[place, w], axis, size, out
+                            )
+                            at = np.searchsorted(edges, out[3], side="right") - 1
+                            ring[place, w, lane] = min(max(at, 0), num_rings - 1)
+                access += 1
+                for lane in range(warp_size):
+                    if not active[place, w, lane]:
+                        continue
+                    out = sample[place, w, lane]
+                    level = int(out[2]) if reads.follows[k] else 0
+                    wide, tall = reads.width[k, level], reads.height[k, level]
+                    x = int(out[0] * wide / size[0]) if level else int(out[0])
+                    y = int(out[1] * tall / size[1]) if level else int(out[1])
+                    where = (tiles.group[tile], k, level, ring[place, w, lane])
+                    if counting:
+                        counts.lanes[where] += 1
+                    for corner in range(reads.corners[k]):
+                        column = min(x + (corner & 1), wide - 1)
+                        row = min(y + (corner >> 1), tall - 1)
+                        x_term = np.int64(reads.x_tables[reads.x_start[k, level] + column])
+                        y_term = np.int64(reads.y_tables[reads.y_start[k, level] + row])
+                        low = np.int64(reads.low_mask[k])
+                        address = reads.base[k, level] + (x_term & ~low) + (y_term & ~low)
+                        address += (x_term ^ y_term) & low
+                        number = address // cache.sector_bytes
+                        if cache.asked_at[number] == access:
+                            continue
+                        cache.asked_at[number] = access
+                        line = number // cache.sectors_per_line
+                        there = _look_up(cache, unit, line, number % cache.sectors_per_line)
+                        if counting:
+                            counts.asked[where] += 1
+                        if not there:
+                            filled += 1
+                            if counting:
+                                counts.missed[where] += 1
+                read[place, w] = k + 1
+                if k + 1 == num_reads:
+                    read[place, w] = 0
+                    turn[place, w] += 1
+                    left -= turn[place, w] == turns[place, w]
+            if left == 0:
+                tile_at[place] = -1
+        if running == 0 or (following >= n and not to_end):
+            return access
