@@ -37,13 +37,12 @@ class Swept:
 
 @dataclass(eq=False)
 class Step:
-    """Some time of a launch. scattered: field -> (cells,) bytes. parts: the same from the SMs of
-    some instances of a level that few SMs share, those that are looked at.
+    """Some time of a launch. scattered: field -> (cells,) bytes that go on behind the L1s, and
+    behind the level that some SMs share where there is one.
     """
 
     launch: int
     scattered: dict[int, Floats] = field(default_factory=dict)
-    parts: list[dict[int, Floats]] = field(default_factory=list)
     swept: list[Swept] = field(default_factory=list)
 
 
@@ -128,18 +127,15 @@ def build_frame(
         num_steps = SWEEP_STEPS if cost is None else SCATTER_STEPS
         held = [Step(launch.launch) for _ in range(num_steps)]
         if cost is not None:
-            for part in (None, *machine.looked_at()):
-                for step in held if part is not None else ():
-                    step.parts.append({})
-                found = _arrivals(cost, machine, cells, part)
-                for (texture, level), arrivals in found.items():
-                    index = field_of(texture, level)
-                    for step, bytes_there in zip(held, arrivals, strict=True):
-                        kept = step.scattered if part is None else step.parts[-1]
-                        kept[index] = passed * bytes_there
+            for (texture, level), arrivals in _arrivals(cost, cells).items():
+                index = field_of(texture, level)
+                for step, bytes_there in zip(held, arrivals, strict=True):
+                    step.scattered[index] = passed * bytes_there
         for sweep in (s for s in workload.sweeps if s.launch == launch.launch):
             index = field_of(sweep.texture, sweep.mip)
-            l1_swept += _add_sweep(sweep, index, sizes[index], held, cells, scattering, machine, memory)
+            l1_swept += _add_sweep(
+                sweep, index, sizes[index], held, cells, scattering, machine, memory
+            )
         steps += held
     return Frame(np.outer(sizes, cells.share), tuple(steps), l1_swept)
 
@@ -172,13 +168,8 @@ def _add_sweep(
     return asked if machine.levels[0].takes_stores or not is_store else 0.0
 
 
-def _arrivals(
-    cost: ScatterCost,
-    machine: Machine,
-    cells: Cells,
-    part: range | None,
-) -> dict[tuple[str, int], Floats]:
-    """(texture, level) -> (steps, cells) bytes that miss the L1s, or those of some units alone."""
+def _arrivals(cost: ScatterCost, cells: Cells) -> dict[tuple[str, int], Floats]:
+    """(texture, level) -> (steps, cells) bytes that go on."""
     plan, scatter = cost.schedule, cost.scatter
     finish = float(plan.end.max()) or 1.0
     edges = np.linspace(0.0, finish, SCATTER_STEPS + 1)
@@ -186,11 +177,6 @@ def _arrivals(
     found: dict[tuple[str, int], Floats] = {}
     for of_class in cost.classes:
         tiles = of_class.tiles
-        if part is not None:
-            units = plan.unit[tiles]
-            tiles = tiles[(units >= part.start) & (units < part.stop)]
-            if not len(tiles):
-                continue
         start, end = plan.start[tiles], plan.end[tiles]
         at = cells.of_tiles(scatter.tile_x[tiles], scatter.tile_y[tiles])
         sources = np.zeros((SCATTER_STEPS, *shape))
@@ -200,9 +186,11 @@ def _arrivals(
             there = np.bincount(at, weight, cells.num).reshape(cells.down, cells.across)
             sources[k, : cells.down, : cells.across] = there
         moved = np.fft.rfft2(sources)
-        for read, by_level in zip(scatter.reads, of_class.missed / len(of_class.tiles), strict=True):
+        for read, by_level in zip(
+            scatter.reads, of_class.passed / len(of_class.tiles), strict=True
+        ):
             for level, missed in enumerate(by_level):
-                total = float(missed.sum()) * machine.levels[0].sector_bytes
+                total = float(missed.sum())
                 if total <= 0.0:
                     continue
                 kernel = np.fft.rfft2(_kernel(cost.edges, missed, cells, shape, scatter.direction))

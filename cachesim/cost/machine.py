@@ -53,17 +53,10 @@ class Machine:
             found.append(("llc", gpu.llc, 1, count))
         return Machine(gpu, tuple(_level(*level) for level in found))
 
-    def looked_at(self) -> tuple[range, ...]:
-        """The L1 units behind some instances of a level that a few SMs share (RDNA's GL1): two of
-        them stand for all.
-        """
-        units = self.levels[0].instances // self.gpu.sm.count
-        shared = next((v for v in self.levels[1:] if v.instances > 1), None)
-        if shared is None:
-            return ()
-        per = shared.sms * units
-        chosen = sorted({shared.instances // 4, 3 * shared.instances // 4})
-        return tuple(range(k * per, (k + 1) * per) for k in chosen)
+    @property
+    def shared(self) -> LevelOfCost | None:
+        """The level that a few SMs share (RDNA's GL1)."""
+        return next((v for v in self.levels[1:] if v.instances > 1), None)
 
     def resident(self, launch: LaunchWork) -> int:
         """CTAs of a launch that one SM holds."""

@@ -95,5 +95,3 @@ def _spread(texels: int, side: int) -> Ints:
     chosen = np.unique(np.linspace(0, blocks - 1, min(blocks, _LOOKED_AT)).astype(np.int64))
     found: Ints = chosen * side
     return found
-
-

@@ -157,8 +157,9 @@ class Prepared:
         return model.value("l1.passed") * self.missed_bytes + self.swept_below
 
     def steps(self, model: CostModel) -> Frame:
-        """The frame as it comes to the level behind the L1."""
-        passed = model.value("l1.passed")
+        """The frame as it comes to the levels that all SMs share."""
+        last = self.machine.levels[0] if self.machine.shared is None else self.machine.shared
+        passed = model.value(f"{last.name}.passed")
         return build_frame(self.workload, self.costs, self.machine, self.memory, passed)
 
     def pass_through(
@@ -166,7 +167,12 @@ class Prepared:
     ) -> Passed:
         """A frame's steps through level `index`; from 1, the level behind the L1."""
         level = self.machine.levels[index]
-        return pass_level(level, frame.size, steps, 1.0, model.value(f"{level.name}.passed"))
+        factor = model.value(f"{level.name}.passed")
+        if level is not self.machine.shared:
+            return pass_level(level, frame.size, steps, factor)
+        # What it passes on of the scattered reads was drawn, and is in the steps already.
+        alone = tuple(Step(step.launch, swept=step.swept) for step in steps)
+        return pass_level(level, frame.size, alone, 1.0).with_scattered(steps)
 
 
 def _asked_of_first(frame: Frame, machine: Machine) -> float:
@@ -197,7 +203,8 @@ def predict_prepared(prepared: Prepared, model: CostModel) -> Prediction:
     l2_asked: Mapping[int, float] = {}
     for index, level in enumerate(machine.levels[1:], 1):
         passed = prepared.pass_through(model, frame, index, steps)
-        demand[level.name] = sum(passed.asked.values())
+        drawn = level is machine.shared
+        demand[level.name] = prepared.asked_below_l1(model) if drawn else sum(passed.asked.values())
         if level.name == "l2":
             l2_asked = passed.asked
         steps = passed.steps

@@ -11,10 +11,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
+import numpy.typing as npt
 
 from cachesim.address import set_hash, set_indices
+from cachesim.config import CacheLevel
 from cachesim.cost.dispatch import Schedule, dispatch
 from cachesim.cost.machine import Machine
 from cachesim.cost.memory import Memory
@@ -27,6 +30,7 @@ from cachesim.cost.workload import (
     TILE_SIDE,
     Floats,
     Ints,
+    LaunchWork,
     Optics,
     Scatter,
     Workload,
@@ -34,16 +38,18 @@ from cachesim.cost.workload import (
 
 NUM_RINGS = 24
 #: Reads of lanes that are drawn for a launch, about; windows that they are drawn in, at least.
-NUM_DRAWN = 600_000
+NUM_DRAWN = 1_500_000
 _MIN_WINDOWS = 3
 #: An SM's tiles are walked in full where they are so many times what it holds, or fewer.
 _FULL = 3.0
 #: Classes of tiles per doubling of the scale and of the count.
 _PER_OCTAVE = np.array([1.0, 2.0])
-#: Accesses of a tile without samples, which leaves at once.
-_IDLE_ACCESSES = 4.0
 _SEED = 20
 _GOLDEN = 0.6180339887498949
+_NO_CACHE = Cache(
+    np.zeros(0, np.uint32), 0, 1, 1, np.zeros((0, 0), np.uint8), np.zeros((0, 0), np.int32),
+    np.zeros((0, 0), np.int32), np.zeros((0, 0), np.int32), np.zeros(0, np.int64),
+)  # fmt: skip
 _AXES = {"around": 0, "x": 1, "y": 2}
 
 
@@ -53,7 +59,8 @@ class TileClass:
 
     tiles: indices into the scatter. turns: of the loop, of one tile's warps on average. lanes,
     asked, missed: (textures, levels, rings), summed over the tiles: lanes' reads, sectors asked of
-    the L1 and missed there.
+    the L1 and missed there. passed: bytes that go on behind the L1s, and behind the level that some
+    SMs share where there is one.
     """
 
     tiles: Ints
@@ -61,6 +68,7 @@ class TileClass:
     lanes: Floats
     asked: Floats
     missed: Floats
+    passed: Floats
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,11 +100,14 @@ def cost_scatter(
     """Schedule the tiles of a launch, class them, and draw what the reads of each class cost."""
     launch = next(w for w in workload.launches if w.launch == scatter.launch)
     works = scatter.samples > 0
-    accesses = scatter.steps * float(len(scatter.reads)) + _IDLE_ACCESSES
+    beside = _accesses_beside(workload, scatter, launch)
+    # A GPU with warps of 64 lanes joins two of a recording.
+    by_warp = scatter.counts.reshape(len(works), -1, machine.gpu.sm.warp_size).max(axis=2)
+    accesses = by_warp * len(scatter.reads) + np.where(by_warp > 0, beside[1], beside[0])
     sms = machine.gpu.sm.count
     units = machine.levels[0].instances // sms
     places = machine.resident(launch)
-    schedule = dispatch(accesses, works, sms, places, units)
+    schedule = dispatch(accesses, sms, places, units)
     edges = _ring_edges(workload, scatter)
     working = np.flatnonzero(works)
     if not len(working):
@@ -108,7 +119,7 @@ def cost_scatter(
     codes, of_working = np.unique(code, axis=0, return_inverse=True)
     group = np.zeros(len(works), np.int64)
     group[working] = of_working.ravel()
-    drawn = _Drawing(workload, scatter, machine, memory, schedule, group, places, edges)
+    drawn = _Drawing(workload, scatter, machine, memory, schedule, group, places, edges, beside)
     counts = drawn.draw(len(codes))
     classes = []
     for k in range(len(codes)):
@@ -119,9 +130,27 @@ def cost_scatter(
         nearest = int(np.argmin(away))
         factor = float(scatter.samples[tiles].sum()) / max(float(counts.drawn[nearest]), 1.0)
         turns = float(scatter.steps[tiles].mean()) / max(launch.warps_per_cta, 1)
-        found = (part[nearest] * factor for part in (counts.lanes, counts.asked, counts.missed))
-        classes.append(TileClass(tiles, max(turns, 1.0), *found))
+        lanes, asked, missed, missed_shared = (part[nearest] * factor for part in counts[1:])
+        passed = missed * machine.levels[0].sector_bytes
+        if machine.shared is not None:
+            passed = missed_shared * machine.shared.sector_bytes
+        classes.append(TileClass(tiles, max(turns, 1.0), lanes, asked, missed, passed))
     return ScatterCost(scatter, schedule, edges, tuple(classes))
+
+
+def _accesses_beside(workload: Workload, scatter: Scatter, launch: LaunchWork) -> Ints:
+    """(2,) accesses beside the loop of a warp without samples, and of one with; at least 1."""
+    by_warp = scatter.counts.reshape(len(scatter.counts), launch.warps_per_cta, -1)
+    working = int(np.count_nonzero(by_warp.any(axis=2)))
+    every = launch.num_ctas * launch.warps_per_cta
+    idle = busy = 0
+    for sweep in (s for s in workload.sweeps if s.launch == launch.launch):
+        if sweep.rows > working or working == every:
+            idle += max(1, round(sweep.rows / every))
+            busy += max(1, round(sweep.rows / every))
+        else:
+            busy += 1
+    return np.array([max(idle, 1), max(busy, 1)])
 
 
 def _ring_edges(workload: Workload, scatter: Scatter) -> Floats:
@@ -152,6 +181,18 @@ def _rule(optics: Optics, workload: Workload) -> Rule:
 
 
 @dataclass(frozen=True, eq=False)
+class _Window:
+    """Some SMs from a moment on. by_sm: tiles of each, in the order that it takes them. moment: as
+    in the schedule; where it is not the launch's start, the caches are to be warmed first. to_end:
+    the last of the tiles are the launch's last.
+    """
+
+    by_sm: list[Ints]
+    moment: float
+    to_end: bool
+
+
+@dataclass(frozen=True, eq=False)
 class _Drawing:
     """Draws the reads of a launch."""
 
@@ -163,67 +204,85 @@ class _Drawing:
     group: Ints
     places: int
     edges: Floats
+    beside: Ints
 
     def draw(self, num_classes: int) -> Counts:
         """Walk some windows of the launch."""
         shape = (num_classes, len(self.scatter.reads), MAX_LEVEL + 1, len(self.edges) - 1)
-        counts = Counts(np.zeros(num_classes, np.int64), *(np.zeros(shape, np.int64) for _ in "123"))
+        counts = Counts(
+            np.zeros(num_classes, np.int64), *(np.zeros(shape, np.int64) for _ in "1234")
+        )
         reads, rule = self._reads(), _rule(self.workload.optics, self.workload)
         taps = np.asarray(self.scatter.taps_mm, np.float64)
-        cache, access = self._cache(), 0
-        for seed, (tiles, warm, to_end) in enumerate(self._windows()):
-            for array in (cache.valid, cache.held):
-                array.fill(0)
-            self._empty(cache)
+        machine, gpu = self.machine, self.machine.gpu
+        sms = self._sms_together()
+        units = machine.levels[0].instances // gpu.sm.count
+        l1 = self._cache(gpu.l1_texture or gpu.l1, units * sms)
+        shared = self._cache(gpu.gl1, 1) if gpu.gl1 is not None else _NO_CACHE
+        access = 0
+        for seed, window in enumerate(self._windows(sms)):
+            for cache in (l1, shared):
+                _empty(cache)
             access = walk(
-                self._tiles(tiles), reads, rule, taps, _AXES[self.scatter.direction], cache,
-                self.places, self.machine.gpu.sm.warp_size, self.edges, warm, to_end,
-                _SEED + seed, access, counts,
+                self._tiles(window), reads, rule, taps, _AXES[self.scatter.direction], l1, shared,
+                self.places, gpu.sm.warp_size, self.edges, window.moment > 0.0, window.to_end, _SEED + seed, access,
+                counts,
             )  # fmt: skip
         return counts
 
-    def _windows(self) -> Iterator[tuple[Ints, bool, bool]]:
-        """Tiles of one SM in the order that it takes them; whether the L1 is to be warmed first,
-        and whether the last of them ends the launch.
-        """
+    def _sms_together(self) -> int:
+        """SMs that are walked together: those that share a level."""
+        return 1 if self.machine.shared is None else self.machine.shared.sms
+
+    def _windows(self, together: int) -> Iterator[_Window]:
+        """The windows of the launch that are drawn, `together` SMs each."""
         units = self.machine.levels[0].instances // self.machine.gpu.sm.count
         sm = self.schedule.unit // units
-        working = np.flatnonzero(self.scatter.samples > 0)
-        order = working[np.lexsort((working, self.schedule.start[working], sm[working]))]
-        per_sm = np.split(order, np.flatnonzero(np.diff(sm[order])) + 1)
-        per_tile = float(self.scatter.samples[working].mean()) * len(self.scatter.reads)
+        order = np.lexsort((np.arange(len(sm)), self.schedule.start, sm))
+        edges = np.searchsorted(sm[order], np.arange(self.machine.gpu.sm.count + 1))
+        per_sm = [order[a:b] for a, b in pairwise(edges)]
+        groups = [per_sm[k : k + together] for k in range(0, len(per_sm), together)]
+        samples = self.scatter.samples
+        groups = [g for g in groups if any(samples[tiles].any() for tiles in g)]
+        per_tile = float(self.scatter.samples.mean()) * len(self.scatter.reads)
         longest = max(len(tiles) for tiles in per_sm)
         if longest <= _FULL * self.places:
-            wanted = max(_MIN_WINDOWS, round(NUM_DRAWN / (longest * per_tile)))
+            wanted = max(_MIN_WINDOWS, NUM_DRAWN / (longest * per_tile * together))
             # Neighbouring SMs hold neighbouring tiles: those chosen lie all over the frame.
-            order_of_sms = np.argsort(np.arange(len(per_sm)) * _GOLDEN % 1.0)
-            for k in order_of_sms[:wanted]:
-                yield per_sm[k], False, True
+            chosen = np.argsort(np.arange(len(groups)) * _GOLDEN % 1.0)[: round(wanted)]
+            for k in chosen:
+                yield _Window(groups[k], 0.0, True)
             return
-        # One generation to warm up, at most, and one to count.
+        # What runs at some moment and as much again: to warm up, at most, and to count.
         length = 2 * self.places
-        wanted = max(_MIN_WINDOWS, round(NUM_DRAWN / (length * per_tile)))
+        wanted = max(_MIN_WINDOWS, round(NUM_DRAWN / (length * per_tile * together)))
+        finish = float(self.schedule.end.max())
         for k in range(wanted):
-            tiles = per_sm[int(((k + 1) * _GOLDEN % 1.0) * len(per_sm))]
-            first = int((len(tiles) - length) * (k + 0.5) / wanted)
-            first = max(first, 0)
-            chosen_tiles = tiles[first : first + length]
-            yield chosen_tiles, first > 0, first + length >= len(tiles)
+            group = groups[int(((k + 1) * _GOLDEN % 1.0) * len(groups))]
+            moment = finish * k / wanted
+            from_then = [tiles[self.schedule.end[tiles] > moment][:length] for tiles in group]
+            ends = all(len(tiles) < length for tiles in from_then)
+            yield _Window(from_then, moment, ends)
 
-    def _tiles(self, chosen: Ints) -> Tiles:
-        s, optics = self.scatter, self.workload.optics
+    def _tiles(self, window: _Window) -> Tiles:
+        s, optics, chosen = self.scatter, self.workload.optics, np.concatenate(window.by_sm)
+        begin, end = self.schedule.start[chosen], self.schedule.end[chosen]
+        done = np.clip((window.moment - begin) / np.maximum(end - begin, 1e-9), 0.0, 0.999)
         scale = np.maximum(s.texels_per_mm[chosen], 1e-6)
         start = np.zeros(len(chosen))
         if optics.centre_reweighting and not s.taps_mm:
             reach = 1.0 / (scale * optics.d_mm)
             start = 1.0 - 0.25 * np.exp(-reach) - 0.75 * np.exp(-reach / 3.0)
         return Tiles(
+            np.cumsum([0] + [len(tiles) for tiles in window.by_sm]),
             s.tile_x[chosen] * TILE_SIDE,
             s.tile_y[chosen] * TILE_SIDE,
             s.counts[chosen].astype(np.int64),
             scale,
             start,
             self.group[chosen],
+            done,
+            self.beside,
         )
 
     def _reads(self) -> Reads:
@@ -238,31 +297,37 @@ class _Drawing:
             np.array([4 if read.bilinear else 1 for read in reads]),
         )  # fmt: skip
 
-    def _cache(self) -> Cache:
-        machine, level = self.machine, self.machine.levels[0]
-        config = machine.gpu.l1_texture or machine.gpu.l1
-        units = level.instances // machine.gpu.sm.count
-        num_lines = -(-self.memory.placed.footprint_bytes // level.line_bytes) + 1
+    def _cache(self, config: CacheLevel, units: int) -> Cache:
+        placed, line_bytes = self.memory.placed, config.line_bytes
+        num_lines = -(-placed.footprint_bytes // line_bytes) + 1
         hashed = set_hash(config)
         lines = np.arange(num_lines, dtype=np.uint64)
-        lines += np.uint64(self.memory.placed.base_address // level.line_bytes)
+        lines += np.uint64(placed.base_address // line_bytes)
         set_of = np.zeros(num_lines, np.uint32)
         set_indices(lines, num_lines, hashed.kind, hashed.size, hashed.table, set_of)
-        linked = (units, num_lines + config.num_sets)
-        return Cache(
-            set_of,
-            config.ways,
-            level.sectors_per_line,
-            level.sector_bytes,
-            np.zeros((units, num_lines), np.uint8),
-            np.zeros(linked, np.int32),
-            np.zeros(linked, np.int32),
-            np.zeros((units, config.num_sets), np.int32),
-            np.zeros(num_lines * level.sectors_per_line, np.int64),
-        )
+        return _cache(config, units, set_of)
 
-    def _empty(self, cache: Cache) -> None:
-        """Every set's list holds its own entry alone."""
-        own = np.arange(cache.valid.shape[1], cache.newer.shape[1], dtype=np.int32)
-        cache.newer[:, own] = own
-        cache.older[:, own] = own
+
+def _cache(config: CacheLevel, units: int, set_of: npt.NDArray[np.uint32]) -> Cache:
+    num_lines = len(set_of)
+    linked = (units, num_lines + config.num_sets)
+    return Cache(
+        set_of,
+        config.ways,
+        config.sectors_per_line,
+        config.sector_bytes,
+        np.zeros((units, num_lines), np.uint8),
+        np.zeros(linked, np.int32),
+        np.zeros(linked, np.int32),
+        np.zeros((units, config.num_sets), np.int32),
+        np.zeros(num_lines * config.sectors_per_line, np.int64),
+    )
+
+
+def _empty(cache: Cache) -> None:
+    """Take every line out: each set's list holds its own entry alone."""
+    cache.valid.fill(0)
+    cache.held.fill(0)
+    own = np.arange(cache.valid.shape[1], cache.newer.shape[1], dtype=np.int32)
+    cache.newer[:, own] = own
+    cache.older[:, own] = own

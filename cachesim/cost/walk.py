@@ -1,10 +1,11 @@
-"""R(d), drawn: made-up samples of a few tiles, and which of their sectors one L1 holds.
+"""R(d), drawn: made-up samples of a few tiles, and which of their sectors the caches near them hold.
 
 The distance and direction of each sample are random, as the profile has them; its mip follows by Eq
 5.12, its texel by the lane's pixel, its sector by the layout. Warps of the tiles that an SM holds
-take turns, one access each, as in the counting model; the L1 has the sets, ways and sectors of the
-configuration and replaces the least recently used line. What is counted is by the tile's class, the
-texture, the level and the distance.
+take turns, one access each, as in the counting model. An L1 has the sets, ways and sectors of the
+configuration and replaces the least recently used line; so has a level that a few SMs share (RDNA's
+GL1), and then these SMs are walked together. What is counted is by the tile's class, the texture,
+the level and the distance.
 """
 
 from __future__ import annotations
@@ -15,7 +16,8 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-MAX_LEVELS = 6
+#: Times that as many sectors were missed as there are lines, after which a cache counts as filled.
+_FILLS = 3
 
 
 class Rule(NamedTuple):
@@ -31,17 +33,21 @@ class Rule(NamedTuple):
 
 
 class Tiles(NamedTuple):
-    """The tiles of a window. x, y: (n,) of the first pixel. count: (n, 64) samples of each pixel.
+    """The tiles of a window, SM by SM. first: (SMs + 1,) where those of each SM begin. x, y: (n,) of the first pixel. count: (n, 64) samples of each pixel.
     scale: (n,) texels per mm. start: (n,) of the profile's cdf, which lies in the own pixel. group:
-    (n,) class.
+    (n,) class. done: (n,) share of its turns that is over when the window begins.
+    beside: (2,) accesses beside the loop of a warp without samples, and of one with.
     """
 
+    first: npt.NDArray[np.int64]
     x: npt.NDArray[np.int64]
     y: npt.NDArray[np.int64]
     count: npt.NDArray[np.int64]
     scale: npt.NDArray[np.float64]
     start: npt.NDArray[np.float64]
     group: npt.NDArray[np.int64]
+    done: npt.NDArray[np.float64]
+    beside: npt.NDArray[np.int64]
 
 
 class Reads(NamedTuple):
@@ -62,7 +68,7 @@ class Reads(NamedTuple):
 
 
 class Cache(NamedTuple):
-    """The L1 units of an SM. valid: (units, lines) bits of sectors, 0 where absent. newer, older:
+    """The units of a level. set_of: (lines,), empty where there is no such level. valid: (units, lines) bits of sectors, 0 where absent. newer, older:
     (units, lines + sets) doubly linked lists, a set's own entry behind the lines. held: (units,
     sets). asked_at: (sectors,) the access that asked last.
     """
@@ -79,20 +85,22 @@ class Cache(NamedTuple):
 
 
 class Counts(NamedTuple):
-    """(classes, textures, levels, rings) int64 each: reads of lanes, sectors asked of the L1, and
-    missed. drawn: (classes,) samples, those beyond the frame too that a filter does not read.
+    """(classes, textures, levels, rings) int64 each: reads of lanes, sectors asked of the L1,
+    missed there, and missed by the level that SMs share too. drawn: (classes,) samples, those beyond the frame too that a filter does not read.
     """
 
     drawn: npt.NDArray[np.int64]
     lanes: npt.NDArray[np.int64]
     asked: npt.NDArray[np.int64]
     missed: npt.NDArray[np.int64]
+    missed_shared: npt.NDArray[np.int64]
 
 
 @njit(cache=True, nogil=True)
-def _look_up(cache: Any, unit: Any, line: Any, sector: Any) -> bool:
+def _look_up(cache: Any, unit: Any, number: Any) -> bool:
     """Look up a sector, and fetch it where it is missing; whether it was there."""
-    bit = np.uint8(1 << sector)
+    line = number // cache.sectors_per_line
+    bit = np.uint8(1 << number % cache.sectors_per_line)
     num_lines = cache.valid.shape[1]
     newer, older, own = cache.newer[unit], cache.older[unit], num_lines + cache.set_of[line]
     was = cache.valid[unit, line]
@@ -112,8 +120,25 @@ def _look_up(cache: Any, unit: Any, line: Any, sector: Any) -> bool:
 
 
 @njit(cache=True, nogil=True)
+def _address(reads: Any, k: Any, level: Any, row: Any, column: Any) -> Any:
+    """Byte of a texel, from the first that is placed."""
+    x_term = np.int64(reads.x_tables[reads.x_start[k, level] + column])
+    y_term = np.int64(reads.y_tables[reads.y_start[k, level] + row])
+    low = np.int64(reads.low_mask[k])
+    return reads.base[k, level] + (x_term & ~low) + (y_term & ~low) + ((x_term ^ y_term) & low)
+
+
+@njit(cache=True, nogil=True)
 def _sample(
-    tiles: Any, tile: Any, lane: Any, rule: Any, taps: Any, turn: Any, axis: Any, size: Any, out: Any
+    tiles: Any,
+    tile: Any,
+    lane: Any,
+    rule: Any,
+    taps: Any,
+    turn: Any,
+    axis: Any,
+    size: Any,
+    out: Any,
 ) -> bool:
     """Place a lane's sample: x, y in texels, level and distance into `out`; whether it is read."""
     x = tiles.x[tile] + lane % 8 + 0.5
@@ -159,7 +184,8 @@ def walk(
     rule: Any,
     taps: Any,
     axis: Any,
-    cache: Any,
+    l1: Any,
+    shared: Any,
     places: Any,
     warp_size: Any,
     edges: Any,
@@ -169,103 +195,130 @@ def walk(
     access: Any,
     counts: Any,
 ) -> Any:
-    """Take the tiles of one SM, in order, through its L1.
+    """Take the tiles of some SMs, each SM's in order, through their L1s and what they share.
 
-    taps: (T,) mm of a filter, along `axis` 1 (x) or 2 (y); 0 samples around. places: tiles held at
-    a time. edges: (rings + 1,) texels. warm: whether to count only once the L1 has been filled
-    or all first tiles have left. to_end: count until the last tile ends, else until none
-    is waiting. access: number of the first access, above all earlier ones. Returns that of the
+    taps: (T,) mm of a filter, along `axis` 1 (x) or 2 (y); 0 samples around. places: tiles that an
+    SM holds at a time. edges: (rings + 1,) texels. warm: whether to count only once the caches have
+    been filled or all first tiles have left. to_end: count until the last tile ends, else until
+    none is waiting. access: number of the first access, above all earlier ones. Returns that of the
     next. Adds to `counts`.
     """
     np.random.seed(seed)
-    n = len(tiles.x)
+    sms = len(tiles.first) - 1
     warps = 64 // warp_size
-    num_reads, units = len(reads.follows), cache.valid.shape[0]
+    num_reads, units, num_rings = len(reads.follows), len(l1.valid) // sms, len(edges) - 1
     size = np.array([reads.width[0, 0], reads.height[0, 0]], np.float64)
-    tile_at = np.full(places, -1, np.int64)
-    turn = np.zeros((places, warps), np.int64)
-    turns = np.zeros((places, warps), np.int64)
-    read = np.zeros((places, warps), np.int64)
-    active = np.zeros((places, warps, warp_size), np.bool_)
-    sample = np.zeros((places, warps, warp_size, 4))
-    ring = np.zeros((places, warps, warp_size), np.int64)
-    following, filled, replaced = 0, 0, 0
-    lines = min(len(cache.set_of), cache.ways * cache.held.shape[1]) * units
-    enough = 3 * lines if warm else 0
-    num_rings = len(edges) - 1
+    following = tiles.first[:-1].copy()
+    tile_at = np.full((sms, places), -1, np.int64)
+    left = np.zeros((sms, places), np.int64)
+    turn = np.zeros((sms, places, warps), np.int64)
+    turns = np.zeros((sms, places, warps), np.int64)
+    read = np.zeros((sms, places, warps), np.int64)
+    pause = np.zeros((sms, places, warps), np.int64)
+    drawn = np.zeros((sms, places, warps), np.bool_)
+    counted = np.zeros((sms, places, warps), np.bool_)
+    active = np.zeros((sms, places, warps, warp_size), np.bool_)
+    sample = np.zeros((sms, places, warps, warp_size, 4))
+    ring = np.zeros((sms, places, warps, warp_size), np.int64)
+    has_shared = len(shared.set_of) > 0
+    filled, filled_shared, replaced = 0, 0, 0
+    enough = _FILLS * l1.ways * l1.held.size if warm else 0
+    enough_shared = _FILLS * shared.ways * shared.held.size if warm else 0
     while True:
-        running = 0
+        running, waiting = 0, 0
         for place in range(places):
-            tile = tile_at[place]
-            if tile < 0:
-                if following >= n:
-                    continue
-                tile = tile_at[place] = following
-                replaced += following >= places
-                following += 1
-                for w in range(warps):
-                    turn[place, w], read[place, w] = 0, 0
-                    turns[place, w] = tiles.count[tile, w * warp_size : (w + 1) * warp_size].max()
-            running += 1
-            unit = place % units
-            counting = filled >= enough or replaced >= places
-            left = warps
             for w in range(warps):
-                if turn[place, w] >= turns[place, w]:
-                    left -= 1
-                    continue
-                k = read[place, w]
-                if k == 0:
-                    for lane in range(warp_size):
-                        pixel = w * warp_size + lane
-                        active[place, w, lane] = turn[place, w] < tiles.count[tile, pixel]
-                        if active[place, w, lane]:
-                            if counting:
+                for sm in range(sms):
+                    tile = tile_at[sm, place]
+                    if w == 0 and tile < 0 and following[sm] < tiles.first[sm + 1]:
+                        tile = tile_at[sm, place] = following[sm]
+                        following[sm] += 1
+                        replaced += tile - tiles.first[sm] >= places
+                        for v in range(warps):
+                            held = tiles.count[tile, v * warp_size : (v + 1) * warp_size]
+                            turns[sm, place, v] = held.max()
+                            done = int(tiles.done[tile] * turns[sm, place, v] * num_reads)
+                            turn[sm, place, v] = done // num_reads
+                            read[sm, place, v] = done % num_reads
+                            drawn[sm, place, v] = False
+                            pause[sm, place, v] = tiles.beside[1 if held.max() else 0]
+                            if done:
+                                pause[sm, place, v] = 0
+                        left[sm, place] = warps
+                    if tile < 0:
+                        continue
+                    running += 1
+                    here = (sm, place, w)
+                    if pause[here]:
+                        # What a warp does beside its loop comes first; it takes its time.
+                        pause[here] -= 1
+                        if turns[here] == 0 and pause[here] == 0:
+                            left[sm, place] -= 1
+                            if left[sm, place] == 0:
+                                tile_at[sm, place] = -1
+                        continue
+                    if turn[here] >= turns[here]:
+                        continue
+                    k = read[here]
+                    if k == 0 or not drawn[here]:
+                        drawn[here] = True
+                        counted[here] = replaced >= places * sms or (
+                            filled >= enough and filled_shared >= enough_shared
+                        )
+                        for lane in range(warp_size):
+                            pixel = w * warp_size + lane
+                            active[here][lane] = turn[here] < tiles.count[tile, pixel]
+                            if not active[here][lane]:
+                                continue
+                            if counted[here]:
                                 counts.drawn[tiles.group[tile]] += 1
-                            out = sample[place, w, lane]
-                            active[place, w, lane] = _sample(
-                                tiles, tile, pixel, rule, taps, turn[place, w], axis, size, out
+                            out = sample[here][lane]
+                            active[here][lane] = _sample(
+                                tiles, tile, pixel, rule, taps, turn[here], axis, size, out
                             )
                             at = np.searchsorted(edges, out[3], side="right") - 1
-                            ring[place, w, lane] = min(max(at, 0), num_rings - 1)
-                access += 1
-                for lane in range(warp_size):
-                    if not active[place, w, lane]:
-                        continue
-                    out = sample[place, w, lane]
-                    level = int(out[2]) if reads.follows[k] else 0
-                    wide, tall = reads.width[k, level], reads.height[k, level]
-                    x = int(out[0] * wide / size[0]) if level else int(out[0])
-                    y = int(out[1] * tall / size[1]) if level else int(out[1])
-                    where = (tiles.group[tile], k, level, ring[place, w, lane])
-                    if counting:
-                        counts.lanes[where] += 1
-                    for corner in range(reads.corners[k]):
-                        column = min(x + (corner & 1), wide - 1)
-                        row = min(y + (corner >> 1), tall - 1)
-                        x_term = np.int64(reads.x_tables[reads.x_start[k, level] + column])
-                        y_term = np.int64(reads.y_tables[reads.y_start[k, level] + row])
-                        low = np.int64(reads.low_mask[k])
-                        address = reads.base[k, level] + (x_term & ~low) + (y_term & ~low)
-                        address += (x_term ^ y_term) & low
-                        number = address // cache.sector_bytes
-                        if cache.asked_at[number] == access:
+                            ring[here][lane] = min(max(at, 0), num_rings - 1)
+                    access += 1
+                    counting = counted[here]
+                    for lane in range(warp_size):
+                        if not active[here][lane]:
                             continue
-                        cache.asked_at[number] = access
-                        line = number // cache.sectors_per_line
-                        there = _look_up(cache, unit, line, number % cache.sectors_per_line)
+                        out = sample[here][lane]
+                        level = int(out[2]) if reads.follows[k] else 0
+                        wide, tall = reads.width[k, level], reads.height[k, level]
+                        x = int(out[0] * wide / size[0]) if level else int(out[0])
+                        y = int(out[1] * tall / size[1]) if level else int(out[1])
+                        where = (tiles.group[tile], k, level, ring[here][lane])
                         if counting:
-                            counts.asked[where] += 1
-                        if not there:
+                            counts.lanes[where] += 1
+                        for corner in range(reads.corners[k]):
+                            column = min(x + (corner & 1), wide - 1)
+                            row = min(y + (corner >> 1), tall - 1)
+                            address = _address(reads, k, level, row, column)
+                            number = address // l1.sector_bytes
+                            if l1.asked_at[number] == access:
+                                continue
+                            l1.asked_at[number] = access
+                            counts.asked[where] += counting
+                            if _look_up(l1, sm * units + place % units, number):
+                                continue
                             filled += 1
-                            if counting:
-                                counts.missed[where] += 1
-                read[place, w] = k + 1
-                if k + 1 == num_reads:
-                    read[place, w] = 0
-                    turn[place, w] += 1
-                    left -= turn[place, w] == turns[place, w]
-            if left == 0:
-                tile_at[place] = -1
-        if running == 0 or (following >= n and not to_end):
+                            counts.missed[where] += counting
+                            if has_shared and not _look_up(
+                                shared, 0, address // shared.sector_bytes
+                            ):
+                                filled_shared += 1
+                                counts.missed_shared[where] += counting
+                    read[here] = k + 1
+                    if k + 1 == num_reads:
+                        read[here] = 0
+                        turn[here] += 1
+                        left[sm, place] -= turn[here] == turns[here]
+                        if left[sm, place] == 0:
+                            tile_at[sm, place] = -1
+        for sm in range(sms):
+            waiting += following[sm] < tiles.first[sm + 1]
+        if waiting < sms and not to_end:
+            return access
+        if running == 0 and waiting == 0:
             return access

@@ -1,13 +1,13 @@
 """Reuse in the caches behind the L1: what of a frame's steps a level finds and what it passes on.
 
 A level keeps what was touched in a window of time that ends now. The window is as long as its lines
-last: the different lines touched in it fill the share of the level that holds useful lines. So a
-texture that one pass wrote is found by the next where little was touched between, and neighbouring
+last: the different lines touched in it fill the level. So a texture that one pass wrote is found by the next where little was touched between, and neighbouring
 tiles find each other's samples where they run at about the same time.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -46,17 +46,23 @@ class Passed:
     read_bytes: float
     written_bytes: float
 
+    def with_scattered(self, steps: Sequence[Step]) -> Passed:
+        """The same, and the scattered reads of these steps beside."""
+        joined, moved, read = [], dict(self.moved), self.read_bytes
+        for mine, other in zip(self.steps, steps, strict=True):
+            joined.append(Step(mine.launch, other.scattered, mine.swept))
+            there = sum(float(b.sum()) for b in other.scattered.values())
+            moved[mine.launch] = moved.get(mine.launch, 0.0) + there
+            read += there
+        return Passed(self.asked, moved, tuple(joined), read, self.written_bytes)
 
-def pass_level(
-    level: LevelOfCost, size: Floats, steps: tuple[Step, ...], share: float, factor: float
-) -> Passed:
+
+def pass_level(level: LevelOfCost, size: Floats, steps: tuple[Step, ...], factor: float) -> Passed:
     """Take a frame's steps through a level.
 
-    size: (fields, cells) bytes. share: of the level's lines, those that hold what is used. factor:
-    on all that it passes on.
+    size: (fields, cells) bytes. factor: on all that it passes on.
     """
-    window = _Window(level, size, share)
-    parts = [_Window(level, size, share) for _ in range(max(len(s.parts) for s in steps))]
+    window = _Window(level, size)
     passed: list[Step] = []
     asked: dict[int, float] = {}
     moved: dict[int, float] = {}
@@ -65,8 +71,6 @@ def pass_level(
         demand = sum(float(b.sum()) for b in step.scattered.values())
         demand += sum(s.requests_bytes for s in step.swept if level.takes_stores or not s.is_store)
         following = window.take(step)
-        if parts:
-            following.scattered = _as_the_parts(step, parts)
         following = _scaled(following, factor)
         reads = sum(float(b.sum()) for b in following.scattered.values())
         reads += sum(s.requests_bytes for s in following.swept if not s.is_store)
@@ -85,29 +89,15 @@ def _scaled(step: Step, factor: float) -> Step:
         Swept(s.field, s.is_store, factor * s.requests_bytes, factor * s.distinct)
         for s in step.swept
     ]
-    return Step(step.launch, scattered, [], swept)
-
-
-def _as_the_parts(step: Step, windows: list[_Window]) -> dict[int, Floats]:
-    """What of a step's scattered reads misses, if all instances are like those looked at."""
-    missed: dict[int, float] = {}
-    arrived: dict[int, float] = {}
-    for part, window in zip(step.parts, windows, strict=False):
-        following = window.take(Step(step.launch, part))
-        for index, there in part.items():
-            arrived[index] = arrived.get(index, 0.0) + float(there.sum())
-            missed[index] = missed.get(index, 0.0) + float(following.scattered[index].sum())
-    shares = {k: missed[k] / arrived[k] for k in arrived if arrived[k] > 0.0}
-    middle = sum(missed.values()) / max(sum(arrived.values()), 1e-300) if arrived else 1.0
-    return {k: there * shares.get(k, middle) for k, there in step.scattered.items()}
+    return Step(step.launch, scattered, swept)
 
 
 class _Window:
     """The steps that a level remembers."""
 
-    def __init__(self, level: LevelOfCost, size: Floats, share: float) -> None:
+    def __init__(self, level: LevelOfCost, size: Floats) -> None:
         self.level, self.size = level, np.maximum(size, 1e-9)
-        self.capacity = share * level.lines
+        self.capacity = float(level.lines)
         self.kept: list[tuple[Floats, Floats]] = []
         self.launch = -1
         self.oldest = 1.0  # share of the oldest step that is still remembered
