@@ -56,13 +56,13 @@ def of_first(held):
         (lambda h: h.update(extra=1), "extra"),
         (lambda h: h.update(models=[]), "models"),
         (lambda h: h["models"].append(h["models"][0]), "twice"),
-        (lambda h: of_first(h).pop("l1.lines"), "'l1.lines' is missing"),
-        (lambda h: of_first(h).update({"l9.lines": of_first(h)["l1.lines"]}), "'l9.lines'"),
-        (lambda h: of_first(h)["l1.lines"].update(value=5.0), "not in 0.8 to 1.1"),
-        (lambda h: of_first(h)["l1.lines"].update(value=0.0, low=0.0), "above 0"),
-        (lambda h: of_first(h)["l1.lines"].update(value="os.system"), "number"),
-        (lambda h: of_first(h)["l1.lines"].update(value=-1.0), "greater than or equal"),
-        (lambda h: of_first(h)["l1.lines"].update(value=float("nan")), "finite"),
+        (lambda h: of_first(h).pop("l2.passed"), "'l2.passed' is missing"),
+        (lambda h: of_first(h).update({"l9.passed": of_first(h)["l2.passed"]}), "'l9.passed'"),
+        (lambda h: of_first(h)["l2.passed"].update(value=5.0), "not in 0.8 to 1.1"),
+        (lambda h: of_first(h)["l2.passed"].update(value=0.0, low=0.0), "above 0"),
+        (lambda h: of_first(h)["l2.passed"].update(value="os.system"), "number"),
+        (lambda h: of_first(h)["l2.passed"].update(value=-1.0), "greater than or equal"),
+        (lambda h: of_first(h)["l2.passed"].update(value=float("nan")), "finite"),
     ),
 )
 def test_a_bad_model_is_one_line_that_names_the_field(model_file, capsys, edit, told):
@@ -138,7 +138,7 @@ def test_a_model_is_fitted_to_recordings_and_predicts_a_scene(first_device, tmp_
     model = tmp_path / "model.json"
     fitting = ["cost", "--fit", *paths, "-o", str(model), "--no-timing"]
     assert run_command(fitting) == 0
-    assert "l1.lines" in capsys.readouterr().out
+    assert "l2.passed" in capsys.readouterr().out
     shown = ["cost", "--model", str(model), "--scene", "close", "--size", "128x72"]
     assert run_command([*shown, "--budget", "16", "--json", "-"]) == 0
     told = json.loads(capsys.readouterr().out)

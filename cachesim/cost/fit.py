@@ -17,7 +17,7 @@ from scipy.stats import t as student
 
 from cachesim.config import Gpu
 from cachesim.cost.cycles import LIMITS, has_timing, launch_cycles, limit_times
-from cachesim.cost.frame import Frame, Step
+from cachesim.cost.frame import Step
 from cachesim.cost.machine import Machine
 from cachesim.cost.model import Coefficient, CostModel, Prepared
 from cachesim.cost.window import Passed
@@ -87,15 +87,11 @@ class _Fit:
             self.prepared.append(Prepared(observation.workload, self.machine))
 
     def run(self) -> CostModel:
-        second = self.machine.levels[1].name
-        self._fit_level("l1.passed", second, lambda k, m: self.prepared[k].asked_below_l1(m))
-        self.progress(0.5)
-        frames = [p.steps(self.model) for p in self.prepared]
-        steps = [frame.steps for frame in frames]
+        steps = [p.frame.steps for p in self.prepared]
         l2_asked: list[Mapping[int, float]] = []
         passed: list[Passed] = []
         for index, level in enumerate(self.machine.levels[1:], 1):
-            passed = self._fit_cache(index, frames, steps)
+            passed = self._fit_cache(index, steps)
             if level.name == "l2":
                 l2_asked = [p.asked for p in passed]
             steps = [p.steps for p in passed]
@@ -105,15 +101,13 @@ class _Fit:
         self.progress(1.0)
         return self.model
 
-    def _fit_cache(
-        self, index: int, frames: Sequence[Frame], steps: Sequence[tuple[Step, ...]]
-    ) -> list[Passed]:
+    def _fit_cache(self, index: int, steps: Sequence[tuple[Step, ...]]) -> list[Passed]:
         """Fit a level behind the L1 to the demand of what follows it; what it passes on then."""
         levels = self.machine.levels
         following = levels[index + 1] if index + 1 < len(levels) else None
 
         def pass_on(k: int, model: CostModel) -> Passed:
-            return self.prepared[k].pass_through(model, frames[k], index, steps[k])
+            return self.prepared[k].pass_through(model, index, steps[k])
 
         def demand(k: int, model: CostModel) -> float:
             found = pass_on(k, model)
@@ -121,9 +115,9 @@ class _Fit:
                 return found.read_bytes + found.written_bytes
             return found.read_bytes
 
-        name = levels[index].name
-        behind = "dram" if following is None else following.name
-        self._fit_level(f"{name}.passed", behind, demand)
+        if levels[index] is not self.machine.shared:
+            behind = "dram" if following is None else following.name
+            self._fit_level(f"{levels[index].name}.passed", behind, demand)
         return [pass_on(k, self.model) for k in range(len(self.prepared))]
 
     def _fit_level(self, name: str, level: str, asked: Callable[[int, CostModel], float]) -> None:
@@ -134,7 +128,8 @@ class _Fit:
             known = {**self.model.coefficients, name: Coefficient(*[float(value[0])] * 3)}
             model = replace(self.model, coefficients=known)
             found = np.array([asked(k, model) for k in range(len(observed))])
-            return found / np.maximum(observed, 1.0) - 1.0
+            relative: Floats = found / np.maximum(observed, 1.0) - 1.0
+            return relative
 
         solved = least_squares(
             differences, np.ones(1), bounds=BOUNDS, diff_step=_DIFFERENCE_STEP, xtol=1e-3,

@@ -99,12 +99,8 @@ def build_frame(
     costs: Sequence[ScatterCost],
     machine: Machine,
     memory: Memory,
-    passed: float = 1.0,
 ) -> Frame:
-    """The steps of a frame on a machine.
-
-    costs: of the workload's scatters. passed: factor on the scattered misses.
-    """
+    """The steps of a frame on a machine. costs: of the workload's scatters."""
     cells = Cells(workload)
     fields: dict[tuple[str, int], int] = {}
     sizes: list[float] = []
@@ -130,7 +126,7 @@ def build_frame(
             for (texture, level), arrivals in _arrivals(cost, cells).items():
                 index = field_of(texture, level)
                 for step, bytes_there in zip(held, arrivals, strict=True):
-                    step.scattered[index] = passed * bytes_there
+                    step.scattered[index] = bytes_there
         for sweep in (s for s in workload.sweeps if s.launch == launch.launch):
             index = field_of(sweep.texture, sweep.mip)
             l1_swept += _add_sweep(

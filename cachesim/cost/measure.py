@@ -73,7 +73,7 @@ def measure_workload(trace: Trace, where: str = "trace") -> Workload:
         width,
         height,
         optics,
-        trace.textures,
+        tuple(trace.textures),
         scatters,
         tuple(sweep for launch in measured for sweep in launch.sweeps()),
         tuple(launch.work() for launch in measured),

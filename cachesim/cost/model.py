@@ -12,10 +12,11 @@ The slides give the formulas and no prose; this is how their symbols are read he
 that are predicted side by side: bytes asked of L1, of L2, bytes moved by DRAM, and cycles.
 
 R(d) has no closed form: what a read costs depends on its distance, on its mip, on what the warp's
-other lanes ask (`footprint`), on which tiles share an L1 and how long its lines last
-(`tiles`), and on what the frame has left in the caches behind (`window`). All that
-follows from the method and the preset; a handful of efficiencies per GPU, `COEFFICIENTS`, are
-fitted to simulated frames (`fit`).
+other lanes ask, on which tiles share an L1 (`dispatch`) and how long its lines last. It is drawn
+(`tiles`, `walk`): random samples of some of the tiles, at the distances that the profile has, go
+through one L1. What the frame finds in the caches behind follows from what fills them (`window`).
+All that follows from the method and the preset; one factor per level and the weights of the
+cycles, `COEFFICIENTS`, are fitted to simulated frames (`fit`).
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ import pandas as pd
 from cachesim.config import Gpu
 from cachesim.cost.cycles import LIMITS, has_timing, launch_cycles, limit_times
 from cachesim.cost.frame import Frame, Step, build_frame
-from cachesim.cost.machine import Machine
+from cachesim.cost.machine import LevelOfCost, Machine
 from cachesim.cost.memory import Memory
 from cachesim.cost.tiles import ScatterCost, cost_scatter
 from cachesim.cost.window import Passed, pass_level
@@ -53,10 +54,10 @@ SYMBOLS = (
     ("m' = f(m, sigma_0^2)", "samples that the pixel takes: m, or what the adaptive estimator "
      "says after some frames", "samples", "the estimator run on the scene"),
     ("d_j", "distance of sample j from its pixel; its mip follows from it by Eq 5.12", "mm",
-     "quantiles of the profile"),
+     "drawn from the profile"),
     ("M(d)", "cost of one sample at distance d", "B, cycles", "R(d) + O(d)"),
     ("R(d)", "its reads: sectors that the warp's lanes do not share, and what the caches do not "
-     "hold", "B", "footprint, window"),
+     "hold", "B", "walk, window"),
     ("O(d)", "what comes with it: its arithmetic, and its share of making the mips",
      "B, cycles", "prefilter's sweeps, instruction counts"),
     ("O(m')", "cost of a pixel beside its samples: its own texels, history, the result's store",
@@ -114,7 +115,8 @@ class CostModel:
 
 def coefficient_names(machine: Machine) -> tuple[str, ...]:
     """The coefficients that a machine's model has."""
-    names = [f"{v.name}.passed" for v in machine.levels]
+    # What the L1 and a level that a few SMs share pass on is drawn, and needs none.
+    names = [f"{v.name}.passed" for v in machine.levels[1:] if v is not machine.shared]
     return (*names, *(f"cycles.{limit}" for limit in LIMITS)) if has_timing(machine) else (*names,)
 
 
@@ -145,39 +147,26 @@ class Prepared:
         self.costs: tuple[ScatterCost, ...] = tuple(
             cost_scatter(workload, scatter, machine, self.memory) for scatter in workload.scatters
         )
+        self.frame: Frame = build_frame(workload, self.costs, machine, self.memory)
         sector = self.memory.sector_bytes
-        frame = build_frame(workload, self.costs, machine, self.memory, 0.0)
-        #: Bytes asked of the L1.
-        self.l1_bytes = sum(c.asked for c in self.costs) * sector + frame.l1_swept_bytes
+        #: Bytes asked of the L1, and of the level behind it.
+        self.l1_bytes = sum(c.asked for c in self.costs) * sector + self.frame.l1_swept_bytes
         self.missed_bytes = sum(c.missed for c in self.costs) * sector
-        self.swept_below = _asked_of_first(frame, machine)
+        self.asked_below_l1 = self.missed_bytes + _swept_bytes(self.frame, machine.levels[1])
 
-    def asked_below_l1(self, model: CostModel) -> float:
-        """Bytes asked of the level behind the L1."""
-        return model.value("l1.passed") * self.missed_bytes + self.swept_below
-
-    def steps(self, model: CostModel) -> Frame:
-        """The frame as it comes to the levels that all SMs share."""
-        last = self.machine.levels[0] if self.machine.shared is None else self.machine.shared
-        passed = model.value(f"{last.name}.passed")
-        return build_frame(self.workload, self.costs, self.machine, self.memory, passed)
-
-    def pass_through(
-        self, model: CostModel, frame: Frame, index: int, steps: tuple[Step, ...]
-    ) -> Passed:
-        """A frame's steps through level `index`; from 1, the level behind the L1."""
+    def pass_through(self, model: CostModel, index: int, steps: tuple[Step, ...]) -> Passed:
+        """The frame's steps through level `index`; from 1, the level behind the L1."""
         level = self.machine.levels[index]
         factor = model.value(f"{level.name}.passed")
         if level is not self.machine.shared:
-            return pass_level(level, frame.size, steps, factor)
+            return pass_level(level, self.frame.size, steps, factor)
         # What it passes on of the scattered reads was drawn, and is in the steps already.
         alone = tuple(Step(step.launch, swept=step.swept) for step in steps)
-        return pass_level(level, frame.size, alone, 1.0).with_scattered(steps)
+        return pass_level(level, self.frame.size, alone, 1.0).with_scattered(steps)
 
 
-def _asked_of_first(frame: Frame, machine: Machine) -> float:
+def _swept_bytes(frame: Frame, level: LevelOfCost) -> float:
     """Bytes that sweeps ask of the level behind the L1."""
-    level = machine.levels[1]
     return sum(
         s.requests_bytes
         for step in frame.steps
@@ -198,13 +187,12 @@ def predict_prepared(prepared: Prepared, model: CostModel) -> Prediction:
     """`predict`, of a workload that is prepared."""
     workload, machine = prepared.workload, prepared.machine
     demand = {"l1": prepared.l1_bytes}
-    frame = prepared.steps(model)
-    steps, passed = frame.steps, None
+    steps, passed = prepared.frame.steps, None
     l2_asked: Mapping[int, float] = {}
     for index, level in enumerate(machine.levels[1:], 1):
-        passed = prepared.pass_through(model, frame, index, steps)
+        passed = prepared.pass_through(model, index, steps)
         drawn = level is machine.shared
-        demand[level.name] = prepared.asked_below_l1(model) if drawn else sum(passed.asked.values())
+        demand[level.name] = prepared.asked_below_l1 if drawn else sum(passed.asked.values())
         if level.name == "l2":
             l2_asked = passed.asked
         steps = passed.steps

@@ -20,31 +20,21 @@ def sample_costs(prepared: Prepared, model: CostModel, num_bins: int = 8) -> pd.
     """
     rows = []
     sector = prepared.machine.levels[0].sector_bytes
-    asked_factor, passed_factor = model.value("l1.asked"), model.value("l1.passed")
-    for spread, misses in zip(prepared.spreads, prepared.misses(model), strict=True):
-        scatter = spread.scatter
-        for read in scatter.reads:
+    for cost in prepared.costs:
+        scatter, distance = cost.scatter, 0.5 * (cost.edges[1:] + cost.edges[:-1])
+        for k, read in enumerate(scatter.reads):
             held = []
-            for found in misses:
-                tile = found.tile_class
-                part = next(r for r in tile.reads if r.texture == read.texture)
-                scale = float(np.mean(scatter.texels_per_mm[tile.tiles]))
-                radius = 0.5 * (part.rings.radius[1:] + part.rings.radius[:-1])
-                lanes = float(scatter.samples[tile.tiles].mean())
-                asked = tile.turns * part.rate * part.rings.num_sectors()
-                levels = np.arange(len(asked))[:, None] + np.zeros_like(radius)
-                held.append(
-                    np.stack(
-                        [
-                            np.broadcast_to(radius / scale, asked.shape),
-                            levels,
-                            tile.num_tiles * lanes * part.rings.share,
-                            tile.num_tiles * asked_factor * asked * sector,
-                            tile.num_tiles * passed_factor * found.by_read[read.texture] * sector,
-                        ],
-                        axis=-1,
-                    ).reshape(-1, 5)
+            for part in cost.classes:
+                scale = float(np.mean(scatter.texels_per_mm[part.tiles]))
+                shape = part.lanes[k].shape
+                columns_of = (
+                    np.broadcast_to(distance / scale, shape),
+                    np.broadcast_to(np.arange(shape[0])[:, None], shape),
+                    part.lanes[k],
+                    part.asked[k] * sector,
+                    part.missed[k] * sector,
                 )
+                held.append(np.stack(columns_of, axis=-1).reshape(-1, 5))
             rows += _binned(np.concatenate(held), num_bins, scatter.pass_name, read.texture)
     columns = ["pass", "texture", "distance_mm", "level", "reads", "l1_bytes", "l2_bytes"]
     return pd.DataFrame(rows, columns=columns)
@@ -79,12 +69,7 @@ def frame_terms(prepared: Prepared, model: CostModel, predicted: Prediction) -> 
     and the pixels' O(m') run in the same launches, so that they share DRAM bytes and cycles.
     """
     by_launch = predicted.by_launch
-    sector = prepared.machine.levels[0].sector_bytes
-    reads = (
-        model.value("l1.passed")
-        * sector
-        * sum(c.total * c.tile_class.num_tiles for group in prepared.misses(model) for c in group)
-    )
+    reads = prepared.missed_bytes
 
     def part(chosen: pd.Series) -> tuple[float, float, float]:
         found = by_launch[chosen]

@@ -125,12 +125,14 @@ def cost_scatter(
     for k in range(len(codes)):
         tiles = working[of_working.ravel() == k]
         # A class that was not drawn costs what the nearest that was does.
-        has = counts.drawn > 0
+        has = counts.drawn.all(axis=1)
         away = np.where(has, np.abs(codes - codes[k]).sum(axis=1), np.inf)
         nearest = int(np.argmin(away))
-        factor = float(scatter.samples[tiles].sum()) / max(float(counts.drawn[nearest]), 1.0)
+        factor = float(scatter.samples[tiles].sum()) / np.maximum(counts.drawn[nearest], 1)
         turns = float(scatter.steps[tiles].mean()) / max(launch.warps_per_cta, 1)
-        lanes, asked, missed, missed_shared = (part[nearest] * factor for part in counts[1:])
+        lanes, asked, missed, missed_shared = (
+            part[nearest] * factor[:, None, None] for part in counts[1:]
+        )
         passed = missed * machine.levels[0].sector_bytes
         if machine.shared is not None:
             passed = missed_shared * machine.shared.sector_bytes
@@ -209,9 +211,7 @@ class _Drawing:
     def draw(self, num_classes: int) -> Counts:
         """Walk some windows of the launch."""
         shape = (num_classes, len(self.scatter.reads), MAX_LEVEL + 1, len(self.edges) - 1)
-        counts = Counts(
-            np.zeros(num_classes, np.int64), *(np.zeros(shape, np.int64) for _ in "1234")
-        )
+        counts = Counts(np.zeros(shape[:2], np.int64), *(np.zeros(shape, np.int64) for _ in "1234"))
         reads, rule = self._reads(), _rule(self.workload.optics, self.workload)
         taps = np.asarray(self.scatter.taps_mm, np.float64)
         machine, gpu = self.machine, self.machine.gpu
@@ -225,8 +225,8 @@ class _Drawing:
                 _empty(cache)
             access = walk(
                 self._tiles(window), reads, rule, taps, _AXES[self.scatter.direction], l1, shared,
-                self.places, gpu.sm.warp_size, self.edges, window.moment > 0.0, window.to_end, _SEED + seed, access,
-                counts,
+                self.places, gpu.sm.warp_size, self.edges, window.moment > 0.0, window.to_end,
+                _SEED + seed, access, counts,
             )  # fmt: skip
         return counts
 
@@ -253,16 +253,19 @@ class _Drawing:
             for k in chosen:
                 yield _Window(groups[k], 0.0, True)
             return
-        # What runs at some moment and as much again: to warm up, at most, and to count.
-        length = 2 * self.places
+        # What runs at some moment and about twice as much: to warm up and to count.
+        length = 3 * self.places
         wanted = max(_MIN_WINDOWS, round(NUM_DRAWN / (length * per_tile * together)))
-        finish = float(self.schedule.end.max())
+        start, end, finish = self.schedule.start, self.schedule.end, float(self.schedule.end.max())
+        lasts = finish * length * len(per_sm) / len(sm)
         for k in range(wanted):
             group = groups[int(((k + 1) * _GOLDEN % 1.0) * len(groups))]
-            moment = finish * k / wanted
-            from_then = [tiles[self.schedule.end[tiles] > moment][:length] for tiles in group]
-            ends = all(len(tiles) < length for tiles in from_then)
-            yield _Window(from_then, moment, ends)
+            moment = max(finish - lasts, 0.0) * (k + 0.5) / wanted
+            yield _Window(
+                [t[(end[t] > moment) & (start[t] < moment + lasts)] for t in group],
+                moment,
+                moment + lasts >= finish,
+            )
 
     def _tiles(self, window: _Window) -> Tiles:
         s, optics, chosen = self.scatter, self.workload.optics, np.concatenate(window.by_sm)

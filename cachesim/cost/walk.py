@@ -1,4 +1,4 @@
-"""R(d), drawn: made-up samples of a few tiles, and which of their sectors the caches near them hold.
+"""R(d), drawn: made-up samples of some tiles, and which of their sectors the near caches hold.
 
 The distance and direction of each sample are random, as the profile has them; its mip follows by Eq
 5.12, its texel by the lane's pixel, its sector by the layout. Warps of the tiles that an SM holds
@@ -33,16 +33,18 @@ class Rule(NamedTuple):
 
 
 class Tiles(NamedTuple):
-    """The tiles of a window, SM by SM. first: (SMs + 1,) where those of each SM begin. x, y: (n,) of the first pixel. count: (n, 64) samples of each pixel.
-    scale: (n,) texels per mm. start: (n,) of the profile's cdf, which lies in the own pixel. group:
-    (n,) class. done: (n,) share of its turns that is over when the window begins.
+    """The tiles of a window, SM by SM.
+
+    first: (SMs + 1,) where those of each SM begin. x, y: (n,) of the first pixel. samples: (n, 64)
+    of each pixel. scale: (n,) texels per mm. start: (n,) of the profile's cdf, which lies in the
+    own pixel. group: (n,) class. done: (n,) share of its turns that is over when the window begins.
     beside: (2,) accesses beside the loop of a warp without samples, and of one with.
     """
 
     first: npt.NDArray[np.int64]
     x: npt.NDArray[np.int64]
     y: npt.NDArray[np.int64]
-    count: npt.NDArray[np.int64]
+    samples: npt.NDArray[np.int64]
     scale: npt.NDArray[np.float64]
     start: npt.NDArray[np.float64]
     group: npt.NDArray[np.int64]
@@ -68,9 +70,11 @@ class Reads(NamedTuple):
 
 
 class Cache(NamedTuple):
-    """The units of a level. set_of: (lines,), empty where there is no such level. valid: (units, lines) bits of sectors, 0 where absent. newer, older:
-    (units, lines + sets) doubly linked lists, a set's own entry behind the lines. held: (units,
-    sets). asked_at: (sectors,) the access that asked last.
+    """The units of a level.
+
+    set_of: (lines,), empty where there is no such level. valid: (units, lines) bits of sectors, 0
+    where absent. newer, older: (units, lines + sets) doubly linked lists, a set's own entry behind
+    the lines. held: (units, sets). asked_at: (sectors,) the access that asked last.
     """
 
     set_of: npt.NDArray[np.uint32]
@@ -86,7 +90,8 @@ class Cache(NamedTuple):
 
 class Counts(NamedTuple):
     """(classes, textures, levels, rings) int64 each: reads of lanes, sectors asked of the L1,
-    missed there, and missed by the level that SMs share too. drawn: (classes,) samples, those beyond the frame too that a filter does not read.
+    missed there, and missed by the level that SMs share too. drawn: (classes, textures) samples,
+    those beyond the frame too that a filter does not read.
     """
 
     drawn: npt.NDArray[np.int64]
@@ -156,9 +161,9 @@ def _sample(
         out[2], out[3] = 0.0, abs(away)
         return True
     start = tiles.start[tile]
-    xi = min(start + np.random.random() * (1.0 - start), 1.0 - 2.0**-24)
+    xi = min(start + np.random.random() * (1.0 - start), 1.0 - 2.0**-24)  # noqa: NPY002 -- numba's own
     r = max(rule.d_mm * ((2.0 - rule.c) * xi - 2.0) * np.log1p(-xi), 1e-5)
-    turned = 2.0 * np.pi * np.random.random()
+    turned = 2.0 * np.pi * np.random.random()  # noqa: NPY002
     reach = r * scale
     out[0] = min(max(x + reach * np.cos(turned), 0.5), size[0] - 0.5)
     out[1] = min(max(y + reach * np.sin(turned), 0.5), size[1] - 0.5)
@@ -167,7 +172,7 @@ def _sample(
     if rule.kind:
         far = np.exp(-r / (3.0 * rule.d_mm))
         q = max((far * far * far + far) / (4.0 * rule.d_mm), 1e-5)
-        q *= rule.damping * tiles.count[tile, lane] / (scale * scale)
+        q *= rule.damping * tiles.samples[tile, lane] / (scale * scale)
         if rule.kind == 2:
             q /= r
         while level < 5 and q < 4.0**-level:
@@ -200,10 +205,10 @@ def walk(
     taps: (T,) mm of a filter, along `axis` 1 (x) or 2 (y); 0 samples around. places: tiles that an
     SM holds at a time. edges: (rings + 1,) texels. warm: whether to count only once the caches have
     been filled or all first tiles have left. to_end: count until the last tile ends, else until
-    none is waiting. access: number of the first access, above all earlier ones. Returns that of the
+    most SMs have none waiting. access: number of the first access, above all earlier ones. Returns that of the
     next. Adds to `counts`.
     """
-    np.random.seed(seed)
+    np.random.seed(seed)  # noqa: NPY002
     sms = len(tiles.first) - 1
     warps = 64 // warp_size
     num_reads, units, num_rings = len(reads.follows), len(l1.valid) // sms, len(edges) - 1
@@ -217,6 +222,7 @@ def walk(
     pause = np.zeros((sms, places, warps), np.int64)
     drawn = np.zeros((sms, places, warps), np.bool_)
     counted = np.zeros((sms, places, warps), np.bool_)
+    tried = np.zeros((sms, places, warps), np.int64)
     active = np.zeros((sms, places, warps, warp_size), np.bool_)
     sample = np.zeros((sms, places, warps, warp_size, 4))
     ring = np.zeros((sms, places, warps, warp_size), np.int64)
@@ -235,7 +241,7 @@ def walk(
                         following[sm] += 1
                         replaced += tile - tiles.first[sm] >= places
                         for v in range(warps):
-                            held = tiles.count[tile, v * warp_size : (v + 1) * warp_size]
+                            held = tiles.samples[tile, v * warp_size : (v + 1) * warp_size]
                             turns[sm, place, v] = held.max()
                             done = int(tiles.done[tile] * turns[sm, place, v] * num_reads)
                             turn[sm, place, v] = done // num_reads
@@ -262,16 +268,16 @@ def walk(
                     k = read[here]
                     if k == 0 or not drawn[here]:
                         drawn[here] = True
+                        tried[here] = 0
                         counted[here] = replaced >= places * sms or (
                             filled >= enough and filled_shared >= enough_shared
                         )
                         for lane in range(warp_size):
                             pixel = w * warp_size + lane
-                            active[here][lane] = turn[here] < tiles.count[tile, pixel]
+                            active[here][lane] = turn[here] < tiles.samples[tile, pixel]
                             if not active[here][lane]:
                                 continue
-                            if counted[here]:
-                                counts.drawn[tiles.group[tile]] += 1
+                            tried[here] += 1
                             out = sample[here][lane]
                             active[here][lane] = _sample(
                                 tiles, tile, pixel, rule, taps, turn[here], axis, size, out
@@ -280,6 +286,8 @@ def walk(
                             ring[here][lane] = min(max(at, 0), num_rings - 1)
                     access += 1
                     counting = counted[here]
+                    if counting:
+                        counts.drawn[tiles.group[tile], k] += tried[here]
                     for lane in range(warp_size):
                         if not active[here][lane]:
                             continue
@@ -318,7 +326,7 @@ def walk(
                             tile_at[sm, place] = -1
         for sm in range(sms):
             waiting += following[sm] < tiles.first[sm + 1]
-        if waiting < sms and not to_end:
+        if 2 * waiting < sms and not to_end:
             return access
         if running == 0 and waiting == 0:
             return access

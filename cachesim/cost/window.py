@@ -1,8 +1,9 @@
 """Reuse in the caches behind the L1: what of a frame's steps a level finds and what it passes on.
 
 A level keeps what was touched in a window of time that ends now. The window is as long as its lines
-last: the different lines touched in it fill the level. So a texture that one pass wrote is found by the next where little was touched between, and neighbouring
-tiles find each other's samples where they run at about the same time.
+last: the different lines touched in it fill the level. So a texture that one pass wrote is found by
+the next where little was touched between, and neighbouring tiles find each other's samples where
+they run at about the same time.
 """
 
 from __future__ import annotations

@@ -343,16 +343,16 @@ def _hybrid_table(prepared: Any, model: CostModel) -> pd.DataFrame:
 
     sector = prepared.machine.levels[0].sector_bytes
     rows = []
-    for spread, misses in zip(prepared.spreads, prepared.misses(model), strict=True):
-        pixels = int(spread.scatter.pixels.sum())
-        missed = sum(c.total * c.tile_class.num_tiles for c in misses)
+    for cost in prepared.costs:
+        pixels = int(cost.scatter.pixels.sum())
+        missed = cost.missed * sector
         rows.append(
             {
-                "pass": spread.scatter.pass_name,
-                "tiles": int((spread.scatter.pixels > 0).sum()),
+                "pass": cost.scatter.pass_name,
+                "tiles": int((cost.scatter.pixels > 0).sum()),
                 "pixels": pixels,
-                "reads_per_pixel": spread.scatter.num_samples / max(pixels, 1),
-                "l2_bytes_per_pixel": model.value("l1.passed") * missed * sector / max(pixels, 1),
+                "reads_per_pixel": cost.scatter.num_samples / max(pixels, 1),
+                "l2_bytes_per_pixel": missed / max(pixels, 1),
             }
         )
     frame = pd.DataFrame(rows)
