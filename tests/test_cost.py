@@ -45,7 +45,7 @@ from traces.synthetic import stream
 from traces.texture import Texture
 
 GPU = "quadro-p4000"
-WEIGHTS = {"issue": 0.7, "l1": 0.3, "l2": 0.4, "dram": 0.9, "latency": 60.0}
+WEIGHTS = {"issue": 0.7, "traffic": 1.3, "latency": 60.0}
 OPTICS = Optics(SKIN.d_sampled_mm, SKIN.dmfp_max_mm, True, "eq-5.12", 6)
 READS = (Read("setup", 8, True), Read("normal", 4, False), Read("profile_id", 1, False))
 

@@ -15,7 +15,7 @@ from cachesim.cost.tiles import ScatterCost
 from cachesim.cost.workload import LaunchWork, Workload
 
 #: The limits, in the order of their coefficients.
-LIMITS = ("issue", "l1", "l2", "dram", "latency")
+LIMITS = ("issue", "traffic", "latency")
 
 
 def has_timing(machine: Machine) -> bool:
@@ -84,8 +84,10 @@ def _of_launch(
     dram_rate = last.num_channels * dram.bus_bytes * dram.data_rate * dram.clock_hz / gpu.clock_hz
     return {
         "issue": launch.instructions / (sms * gpu.sm_timing.num_schedulers) * busiest,
-        "l1": sectors * l1.sector_bytes / (units * l1_rate) * busiest,
-        "l2": l2_asked.get(launch.launch, 0.0) / l2_rate,
-        "dram": dram_moved.get(launch.launch, 0.0) / dram_rate,
+        "traffic": max(
+            sectors * l1.sector_bytes / (units * l1_rate) * busiest,
+            l2_asked.get(launch.launch, 0.0) / l2_rate,
+            dram_moved.get(launch.launch, 0.0) / dram_rate,
+        ),
         "latency": waves * accesses,
     }

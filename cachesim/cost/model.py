@@ -70,9 +70,7 @@ SYMBOLS = (
 COEFFICIENTS = {
     "{level}.passed": "what it passes on / what the model of reuse gives",
     "cycles.issue": "weight of the time to issue every instruction",
-    "cycles.l1": "weight of the time at the L1's peak",
-    "cycles.l2": "weight of the time at the L2's peak",
-    "cycles.dram": "weight of the time at the memory's peak",
+    "cycles.traffic": "weight of the time at the peak of L1, L2 or memory, whichever is longest",
     "cycles.latency": "cycles of a dependent access that nothing hides",
 }
 

@@ -205,8 +205,8 @@ def walk(
     taps: (T,) mm of a filter, along `axis` 1 (x) or 2 (y); 0 samples around. places: tiles that an
     SM holds at a time. edges: (rings + 1,) texels. warm: whether to count only once the caches have
     been filled or all first tiles have left. to_end: count until the last tile ends, else until
-    most SMs have none waiting. access: number of the first access, above all earlier ones. Returns that of the
-    next. Adds to `counts`.
+    most SMs have none waiting. access: number of the first access, above all earlier ones. Returns
+    that of the next. Adds to `counts`.
     """
     np.random.seed(seed)  # noqa: NPY002
     sms = len(tiles.first) - 1
