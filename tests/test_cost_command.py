@@ -13,6 +13,7 @@ from cachesim.cost.machine import Machine
 from cachesim.cost.model import Coefficient, CostModel, coefficient_names
 from experiments.cli import run_command
 from experiments.reproduce import cost_function
+from experiments.reproduce.cost_function_verdicts import LEVELS, judge, summarise
 from traces.errors import InputError
 from traces.parquet import write_parquet
 from traces.synthetic import stream
@@ -165,7 +166,7 @@ def made_errors(model: float, per_n: float) -> pd.DataFrame:
     rows = []
     for held_out in (False, True):
         row: dict[str, object] = {"gpu": GPU, "frame": "made", "held_out": held_out}
-        for level in (*cost_function.LEVELS, "cycles"):
+        for level in (*LEVELS, "cycles"):
             row |= {f"{level}_simulated": 100.0, f"{level}_predicted": 100.0 * (1 + model)}
             row |= {f"{level}_per_n": 100.0 * (1 + per_n), f"{level}_32_bytes": 300.0}
         rows.append(row)
@@ -173,14 +174,14 @@ def made_errors(model: float, per_n: float) -> pd.DataFrame:
 
 
 def test_targets_and_baselines_are_judged():
-    summary = cost_function.summarise(made_errors(-0.15, 0.5))
+    summary = summarise(made_errors(-0.15, 0.5))
     assert summary["model"].tolist() == pytest.approx([0.15] * 8)
     found = {c.quantity.split(":")[0] + str("baseline" in c.quantity): c.agrees
-             for c in cost_function.judge(summary)}  # fmt: skip
+             for c in judge(summary)}  # fmt: skip
     assert found == {
         "L1 demandFalse": False, "L2 demandFalse": False, "DRAM demandFalse": False,
         "cyclesFalse": True, "L2 demandTrue": True, "DRAM demandTrue": True,
     }  # fmt: skip
-    beaten = cost_function.judge(cost_function.summarise(made_errors(0.05, 0.01)))
+    beaten = judge(summarise(made_errors(0.05, 0.01)))
     assert [c.agrees for c in beaten if "proportional" in c.quantity] == [False, False]
     assert all(c.agrees for c in beaten if "mean held-out" in c.quantity)

@@ -14,7 +14,7 @@ from traces.errors import InputError
 from traces.files import replacing, writing
 
 FORMAT, VERSION = "cachesim-cost-model", 1
-_LEVELS = ("l1", "gl1", "l2", "llc")
+_LEVELS = ("l2", "llc")
 MAX_FILE_BYTES = 1 << 20
 
 _Number = Annotated[float, Field(ge=0.0, le=1e9, allow_inf_nan=False)]
@@ -76,7 +76,8 @@ def read_models(path: str | Path) -> dict[str, CostModel]:
     """
     path = Path(path)
     try:
-        data = path.read_bytes()[: MAX_FILE_BYTES + 1]
+        with path.open("rb") as file:
+            data = file.read(MAX_FILE_BYTES + 1)
     except OSError as error:
         raise InputError(f"{path}: {error.strerror or error}") from None
     if len(data) > MAX_FILE_BYTES:
@@ -94,16 +95,15 @@ def read_models(path: str | Path) -> dict[str, CostModel]:
         for name, c in model.coefficients.items():
             _check(name, c, f"{path}: {model.gpu}: coefficients")
         found = {n: Coefficient(c.value, c.low, c.high) for n, c in model.coefficients.items()}
-        for needed in ("l1.asked", "l1.lines", "l1.company", "l1.passed", "l2.lines", "l2.passed"):
-            if needed not in found:
-                raise InputError(f"{path}: {model.gpu}: coefficients: {needed!r} is missing")
+        if "l2.passed" not in found:
+            raise InputError(f"{path}: {model.gpu}: coefficients: 'l2.passed' is missing")
         models[model.gpu] = CostModel(model.gpu, found, model.frames)
     return models
 
 
 def _check(name: str, c: _Coefficient, where: str) -> None:
     level, _, what = name.partition(".")
-    if name not in COEFFICIENTS and (level not in _LEVELS or what not in ("lines", "passed")):
+    if name not in COEFFICIENTS and (level not in _LEVELS or what != "passed"):
         raise InputError(f"{where}: unknown coefficient {name!r}")
     if not c.low <= c.value <= c.high:
         raise InputError(f"{where}: {name}: value {c.value:g} is not in {c.low:g} to {c.high:g}")

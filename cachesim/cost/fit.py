@@ -1,4 +1,4 @@
-"""Fitting the cost function's efficiencies to simulated frames, level by level.
+"""Fitting the cost function's coefficients to simulated frames, level by level.
 
 What a level passes on is the demand of the next, so that each level's coefficients are fitted to
 the demand behind it, with those above already known: relative differences, least squares.

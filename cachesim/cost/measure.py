@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial import cKDTree
 
+from cachesim.cost.scales import NEAR_SHARE, find_scales
 from cachesim.cost.workload import (
     TILE_SIDE,
     Floats,
@@ -32,10 +32,6 @@ DIRECTIONS = {"sampling": "around", "pilot": "around", "separable_h": "x", "sepa
 #: Lanes of a tile whose distances are looked at.
 _MAX_DISTANCES = 4096
 _SIDE_BITS = 14
-#: Share of a tile's samples whose distance tells the scale, and from which distance it does.
-NEAR_SHARE = 0.25
-_FAR_TEXELS = 8.0
-_SCALES = np.geomspace(1e-3, 1e3, 481)
 
 
 def measure_workload(trace: Trace, where: str = "trace") -> Workload:
@@ -216,7 +212,7 @@ class _Launch:
         if taps:
             scale = joined["distance"][:, 0] / np.mean(np.abs(taps))
         else:
-            scale = self._find_scales(optics, joined)
+            scale = find_scales(optics, joined, self.width, self.height)
         textures = dict.fromkeys(self.trace.instructions[i].texture for i in sorted(self.loop))
         described = [(self.trace.textures[t], t) for t in textures]
         reads = tuple(
@@ -244,32 +240,6 @@ class _Launch:
             self.index,
             int(counts.sum()),
         )
-
-    def _find_scales(self, optics: Optics, tiles: dict[str, Any]) -> Floats:
-        """(n,) texels per mm: where samples lie far from their pixels, from the distance of the
-        nearest of them, which the frame's edge does not clamp; else from the mean of distances
-        between whole texels. Tiles too near the edge take the scale of the nearest that is not.
-        """
-        near = np.array([float(optics.radii(np.array(NEAR_SHARE), s)) for s in _SCALES])
-        mean = np.array([_mean_between_texels(optics, s) for s in _SCALES])
-        distance = tiles["distance"]
-        is_far = distance[:, 1] > _FAR_TEXELS
-        scale = np.where(
-            is_far,
-            np.interp(distance[:, 1], near, _SCALES),
-            np.interp(distance[:, 0], mean, _SCALES),
-        )
-        x, y = (tiles[k] * TILE_SIDE + TILE_SIDE / 2 for k in "xy")
-        room = np.minimum(np.minimum(x, self.width - x), np.minimum(y, self.height - y))
-        scatters = tiles["counts"].any(axis=1)
-        clamped = scatters & (room < TILE_SIDE / 2 + np.where(is_far, 1.2 * distance[:, 1], 0.0))
-        sound = np.flatnonzero(scatters & ~clamped)
-        if len(sound):
-            at = np.column_stack([x, y])
-            nearest = cKDTree(at[sound]).query(at[clamped])[1]
-            scale[clamped] = scale[sound[nearest]]
-        found: Floats = scale
-        return found
 
     def sweeps(self) -> list[Sweep]:
         """The accesses that go over the frame."""
@@ -316,15 +286,6 @@ class _Launch:
             int(rows @ (arithmetic + 1)) + trailing,
             int(rows.sum()),
         )
-
-
-def _mean_between_texels(optics: Optics, texels_per_mm: float) -> float:
-    """Mean distance of the samples' texels from their pixels, both whole numbers."""
-    u = (np.arange(256) + 0.5) / 256
-    angle = 2.0 * np.pi * (np.arange(256) * 0.6180339887498949 % 1.0)
-    radius = optics.radii(u, texels_per_mm)
-    x, y = (np.floor(0.5 + radius * turn) for turn in (np.cos(angle), np.sin(angle)))
-    return float(np.hypot(x, y).mean())
 
 
 def _issued(arithmetic: tuple[tuple[str, int], ...]) -> int:

@@ -16,6 +16,8 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
+from cachesim.cost.lru import look_up
+
 #: Times that as many sectors were missed as there are lines, after which a cache counts as filled.
 _FILLS = 3
 
@@ -69,25 +71,6 @@ class Reads(NamedTuple):
     corners: npt.NDArray[np.int64]
 
 
-class Cache(NamedTuple):
-    """The units of a level.
-
-    set_of: (lines,), empty where there is no such level. valid: (units, lines) bits of sectors, 0
-    where absent. newer, older: (units, lines + sets) doubly linked lists, a set's own entry behind
-    the lines. held: (units, sets). asked_at: (sectors,) the access that asked last.
-    """
-
-    set_of: npt.NDArray[np.uint32]
-    ways: int
-    sectors_per_line: int
-    sector_bytes: int
-    valid: npt.NDArray[np.uint8]
-    newer: npt.NDArray[np.int32]
-    older: npt.NDArray[np.int32]
-    held: npt.NDArray[np.int32]
-    asked_at: npt.NDArray[np.int64]
-
-
 class Counts(NamedTuple):
     """(classes, textures, levels, rings) int64 each: reads of lanes, sectors asked of the L1,
     missed there, and missed by the level that SMs share too. drawn: (classes, textures) samples,
@@ -99,29 +82,6 @@ class Counts(NamedTuple):
     asked: npt.NDArray[np.int64]
     missed: npt.NDArray[np.int64]
     missed_shared: npt.NDArray[np.int64]
-
-
-@njit(cache=True, nogil=True)
-def _look_up(cache: Any, unit: Any, number: Any) -> bool:
-    """Look up a sector, and fetch it where it is missing; whether it was there."""
-    line = number // cache.sectors_per_line
-    bit = np.uint8(1 << number % cache.sectors_per_line)
-    num_lines = cache.valid.shape[1]
-    newer, older, own = cache.newer[unit], cache.older[unit], num_lines + cache.set_of[line]
-    was = cache.valid[unit, line]
-    if was:
-        newer[older[line]], older[newer[line]] = newer[line], older[line]
-    elif cache.held[unit, cache.set_of[line]] == cache.ways:
-        victim = newer[own]
-        newer[own], older[newer[victim]] = newer[victim], own
-        cache.valid[unit, victim] = 0
-    else:
-        cache.held[unit, cache.set_of[line]] += 1
-    # The set's entry stands between its newest line and its oldest.
-    newest = older[own]
-    newer[newest], older[line], newer[line], older[own] = line, newest, own, line
-    cache.valid[unit, line] = was | bit
-    return bool(was & bit)
 
 
 @njit(cache=True, nogil=True)
@@ -308,11 +268,11 @@ def walk(
                                 continue
                             l1.asked_at[number] = access
                             counts.asked[where] += counting
-                            if _look_up(l1, sm * units + place % units, number):
+                            if look_up(l1, sm * units + place % units, number):
                                 continue
                             filled += 1
                             counts.missed[where] += counting
-                            if has_shared and not _look_up(
+                            if has_shared and not look_up(
                                 shared, 0, address // shared.sector_bytes
                             ):
                                 filled_shared += 1

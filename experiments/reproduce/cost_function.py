@@ -2,7 +2,7 @@
 against others.
 
 The slides give T(n), T'(n), S(m) and M(d) and no prose. The page states how each symbol is read,
-with its unit; measures each term; fits a handful of efficiencies per GPU on the frames of two views
+with its unit; measures each term; fits a handful of coefficients per GPU on the frames of two views
 and predicts frames of two other views, at other budgets and sizes, against the simulated demand on
 L1, L2 and DRAM and the simulated cycles.
 """
@@ -12,7 +12,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from experiments.reproduce.experiment import Comparison, Experiment, Outcome, Settings
+from experiments.reproduce.cost_function_terms import make_terms
+from experiments.reproduce.cost_function_verdicts import (
+    LEVELS,
+    error_summary,
+    judge,
+    scatter_figure,
+    summarise,
+)
+from experiments.reproduce.experiment import Experiment, Outcome, Settings
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -30,9 +38,6 @@ GPUS = (
 QUICK_GPUS = ("quadro-p4000",)
 FRAMES, QUICK_FRAMES = 8, 4
 SOURCES = ("kernels", "cachesim", "traces")
-#: Targets of the mean held-out error.
-DEMAND_TARGET, CYCLES_TARGET = 0.10, 0.20
-LEVELS = ("l1", "l2", "dram")
 
 
 @dataclass(frozen=True)
@@ -137,20 +142,20 @@ def run(settings: Settings) -> Outcome:
     errors = pd.DataFrame(rows)
     summary = summarise(errors)
     shown = machines[min(1, len(machines) - 1)]
-    terms = _terms(cells, observed, shown, models[shown.name])
+    terms = make_terms(cells, observed, shown, models[shown.name])
     samples = _samples_taken(num_frames, device, settings.quick)
     coefficients = pd.concat([m.frame() for m in models.values()], ignore_index=True)
     symbols = pd.DataFrame(SYMBOLS, columns=["symbol", "meaning", "unit", "from"])
     return Outcome(
         tables={
             "symbols": symbols,
-            "errors": _error_summary(summary),
+            "errors": error_summary(summary),
             "coefficients": coefficients,
             "frames": errors,
             **terms,
             "m-prime": samples,
         },
-        figures={"predicted": _scatter_figure(errors)},
+        figures={"predicted": scatter_figure(errors)},
         comparisons=judge(summary),
         words=_words(cells, timings, shown.name),
         captions={
@@ -248,129 +253,6 @@ def _predicted_of(predicted: Prediction, level: str) -> float | None:
     return predicted.cycles if level == "cycles" else predicted.demand_bytes[level]
 
 
-def summarise(errors: pd.DataFrame) -> pd.DataFrame:
-    """Mean relative error per GPU, level and kind of frame, of the model and the baselines.
-
-    errors: rows of frames as `run` makes them. Columns: gpu, level, frames (how many), held_out,
-    model, worst, per_n, bytes_32.
-    """
-    import pandas as pd
-
-    rows = []
-    for (gpu, held_out), group in errors.groupby(["gpu", "held_out"], sort=False):
-        for level in (*LEVELS, "cycles"):
-            known = group[group[f"{level}_simulated"].notna() & group[f"{level}_predicted"].notna()]
-            if known.empty:
-                continue
-
-            def off(kind: str, known: pd.DataFrame = known, level: str = level) -> pd.Series:
-                found = known[f"{level}_{kind}"].astype(float)
-                return (found / known[f"{level}_simulated"].astype(float) - 1.0).abs()
-
-            rows.append(
-                {
-                    "gpu": gpu,
-                    "level": level,
-                    "frames": len(known),
-                    "held_out": bool(held_out),
-                    "model": float(off("predicted").mean()),
-                    "worst": float(off("predicted").max()),
-                    "per_n": float(off("per_n").mean()),
-                    "bytes_32": float(off("32_bytes").mean()) if level != "cycles" else None,
-                }
-            )
-    return pd.DataFrame(rows).astype({"bytes_32": "float64"})
-
-
-def judge(summary: pd.DataFrame) -> tuple[Comparison, ...]:
-    """The targets, and the baselines that must be beaten."""
-    held = summary[summary["held_out"]]
-    found = []
-    for level in (*LEVELS, "cycles"):
-        rows = held[held["level"] == level]
-        if rows.empty:
-            continue
-        target = CYCLES_TARGET if level == "cycles" else DEMAND_TARGET
-        mean, worst = float(rows["model"].mean()), rows.loc[rows["model"].idxmax()]
-        name = level if level == "cycles" else f"{level.upper()} demand"
-        good = bool((rows["model"] <= target).all())
-        within = f"within {100 * target:.0f} % on {int((rows['model'] <= target).sum())} of "
-        found.append(
-            Comparison(
-                f"{name}: mean held-out error, {len(rows)} GPU{'s' if len(rows) > 1 else ''}",
-                None,
-                f"{100 * mean:.1f}",
-                "%",
-                f"{within}{len(rows)}; most {100 * worst['model']:.1f} % ({worst['gpu']})",
-                good,
-            )
-        )
-        if level in ("l2", "dram"):
-            for column, words in (("per_n", "proportional to n"), ("bytes_32", "32 B a fetch")):
-                beaten = bool((rows["model"] < rows[column]).all())
-                found.append(
-                    Comparison(
-                        f"{name}: error of the baseline, {words}",
-                        None,
-                        f"{100 * float(rows[column].mean()):.0f}",
-                        "%",
-                        "the model is better on every GPU" if beaten else "not beaten on every GPU",
-                        beaten,
-                    )
-                )
-    return tuple(found)
-
-
-def _terms(
-    cells: tuple[Cell, ...], observed: list[dict[str, Observation]], gpu: Gpu, model: CostModel
-) -> dict[str, Any]:
-    """Tables of the terms on one GPU: M(d), the parts of T(n), and the hybrid's w and S."""
-    from cachesim.cost.machine import Machine
-    from cachesim.cost.model import Prepared, predict_prepared
-    from cachesim.cost.terms import frame_terms, sample_costs
-
-    chosen = next(k for k, c in enumerate(cells) if c.scene == "close" and c.kind == "adaptive")
-    prepared = Prepared(observed[chosen][gpu.name].workload, Machine.of(gpu))
-    predicted = predict_prepared(prepared, model)
-    found: dict[str, Any] = {
-        "M-of-d": sample_costs(prepared, model),
-        "T-of-n": frame_terms(prepared, model, predicted),
-    }
-    hybrid = next(
-        (k for k, c in enumerate(cells) if c.kind == "hybrid" and c.scene == "front"), None
-    )
-    if hybrid is not None:
-        found["hybrid"] = _hybrid_table(
-            Prepared(observed[hybrid][gpu.name].workload, Machine.of(gpu)), model
-        )
-    return found
-
-
-def _hybrid_table(prepared: Any, model: CostModel) -> pd.DataFrame:
-    """w_ia, summed, and S of each technique: tiles, share, samples and L2 bytes of a pixel."""
-    import pandas as pd
-
-    sector = prepared.machine.levels[0].sector_bytes
-    rows = []
-    for cost in prepared.costs:
-        pixels = int(cost.scatter.pixels.sum())
-        missed = cost.missed * sector
-        rows.append(
-            {
-                "pass": cost.scatter.pass_name,
-                "tiles": int((cost.scatter.pixels > 0).sum()),
-                "pixels": pixels,
-                "reads_per_pixel": cost.scatter.num_samples / max(pixels, 1),
-                "l2_bytes_per_pixel": missed / max(pixels, 1),
-            }
-        )
-    frame = pd.DataFrame(rows)
-    techniques = frame["pass"].where(~frame["pass"].str.startswith("separable"), "separable")
-    tiles = frame.groupby(techniques)["tiles"].max()
-    frame["w"] = techniques.map(tiles / tiles.sum())
-    return frame
-
-
 def _samples_taken(num_frames: int, device: Device, quick: bool) -> pd.DataFrame:
     """m' = f(m, sigma_0^2): the mean count of a pixel after some frames."""
     import pandas as pd
@@ -401,68 +283,6 @@ def _samples_taken(num_frames: int, device: Device, quick: bool) -> pd.DataFrame
     return pd.DataFrame(rows)
 
 
-def _error_summary(summary: pd.DataFrame) -> Any:
-    from experiments.tables import Column, Table
-
-    shown = summary.assign(
-        kind=summary["held_out"].map({True: "held out", False: "fitted"}),
-        **{c: 100.0 * summary[c] for c in ("model", "worst", "per_n", "bytes_32")},
-    )
-    columns = (
-        Column("gpu", "GPU"),
-        Column("kind", "frames are"),
-        Column("level", "level"),
-        Column("frames", "frames"),
-        Column("model", "model", ".1f"),
-        Column("worst", "worst frame", ".1f"),
-        Column("per_n", "proportional to n", ".0f"),
-        Column("bytes_32", "32 B a fetch", ".0f"),
-    )
-    return Table("Mean size of predicted / simulated - 1, in per cent", shown, columns)
-
-
-def _scatter_figure(errors: pd.DataFrame) -> Any:
-    import numpy as np
-    from matplotlib.figure import Figure
-
-    from experiments.plots import FONT_SIZE, PALETTE
-
-    figure = Figure(figsize=(9.4, 3.0), layout="constrained")
-    panels = figure.subplots(1, 4)
-    markers = ("o", "s", "^", "v", "D", "P", "X", "<", ">")
-    for axes, level in zip(panels, (*LEVELS, "cycles"), strict=True):
-        known = errors[errors[f"{level}_simulated"].notna() & errors[f"{level}_predicted"].notna()]
-        axes.set_title(
-            level if level == "cycles" else f"{level.upper()} demand", fontsize=FONT_SIZE
-        )
-        if known.empty:
-            continue
-        scale = 1e-6
-        for k, (gpu, group) in enumerate(known.groupby("gpu", sort=False)):
-            colour, marker = PALETTE[k % len(PALETTE)], markers[k % len(markers)]
-            for held_out, part in group.groupby("held_out"):
-                axes.plot(
-                    part[f"{level}_simulated"].astype(float) * scale,
-                    part[f"{level}_predicted"].astype(float) * scale,
-                    marker, markersize=3.5, color=colour,
-                    markerfacecolor="none" if held_out else colour,
-                    label=str(gpu) if not held_out and level == "l1" else None,
-                )  # fmt: skip
-        ends = known[f"{level}_simulated"].astype(float) * scale
-        line = np.array([ends.min() / 1.5, ends.max() * 1.5])
-        band = CYCLES_TARGET if level == "cycles" else DEMAND_TARGET
-        axes.plot(line, line, color="0.4", linewidth=0.8)
-        axes.fill_between(line, line * (1 - band), line * (1 + band), color="0.88", zorder=0)
-        axes.set_xscale("log")
-        axes.set_yscale("log")
-        unit = "millions" if level == "cycles" else "MB"
-        axes.set_xlabel(f"simulated ({unit})", fontsize=FONT_SIZE)
-        axes.tick_params(labelsize=FONT_SIZE - 1)
-    panels[0].set_ylabel("predicted", fontsize=FONT_SIZE)
-    figure.legend(loc="outside lower center", ncols=5, fontsize=FONT_SIZE - 1)
-    return figure
-
-
 def _words(cells: tuple[Cell, ...], timings: dict[str, float], shown: str) -> tuple[str, ...]:
     fitted, held = (sum(c.held_out == kind for c in cells) for kind in (False, True))
     seconds = sorted(timings.values())
@@ -474,10 +294,11 @@ def _words(cells: tuple[Cell, ...], timings: dict[str, float], shown: str) -> tu
         "the views ear and side, at other budgets, another target variance and another size. "
         "Workloads come from the G-buffer and the estimator's counts, without a recording; a "
         f"prediction took {seconds[len(seconds) // 2]:.2f} s in the middle.",
-        "A read's cost has no closed form here: d_j and its mip spread a tile's reads; how many "
-        "sectors the lanes of a warp share, which tiles share an L1 and how long its lines last "
-        "give what the L1 passes on; what the frame touched since gives what the L2 passes on. "
-        "Only the coefficients are fitted: they are near 1 where that picture is complete.",
+        "A read's cost has no closed form here. It is drawn: made-up samples of some tiles, at "
+        "random distances of the profile, go through the L1 of the tiles that an SM holds "
+        "together; nothing is fitted there. What the frame touched since gives what the L2 passes "
+        "on, times a fitted factor that is 1 where that picture is complete. Cycles are a fitted "
+        "sum of the times to issue, to move the traffic and to wait.",
         f"M(d), T(n) and the hybrid's w and S are those of {shown}. Bytes of M(d) are per read: 32 "
         "B is a sector that no other lane shares, and nothing that a cache holds.",
     )
@@ -488,7 +309,7 @@ EXPERIMENT = Experiment(
     title="The bandwidth-demand cost function, fitted and held against frames it has not seen",
     chapter="3",
     figure="slide: bandwidth demands cost function",
-    minutes=45,
+    minutes=15,
     quick_minutes=0.7,
     run=run,
 )
