@@ -226,7 +226,7 @@ def _predict(
     if json is not None:
         write_text(Path(json), text + "\n")
     print_table(prediction_table(predicted, machine.clock_hz, f"{scene}, {width}x{height}"))
-    remark(f"predicted in {took:.2f} s, without a simulation")
+    remark(f"predicted in {took:.2f} s, without a recording")
 
 
 def _as_json(predicted: Prediction, clock_hz: int) -> dict[str, Any]:
