@@ -11,6 +11,7 @@ from traces.errors import unknown
 #: Each is a module of this folder, with underscores, that offers `EXPERIMENT`.
 NAMES = (
     "taxonomy",
+    "cost-function",
     "gpu-generations",
     "adaptive-o1",
     "global-accumulation",
