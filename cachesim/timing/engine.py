@@ -191,9 +191,9 @@ def _receive_requests(state, node):  # type: ignore[no-untyped-def]
     level = tags.level[0]
     for _ in range(level.width):
         if home.in_count + level.reserve_in > level.queue_in or arrival(state.up, node) > now:
-            return
+            break
         if machine.output_queued and home.delay_count >= level.delay_capacity:
-            return
+            break
         request, entered = pop(state.up, node)
         machine.progress = now
         book(state.pool, S_REQUEST, entered, now)
@@ -215,6 +215,9 @@ def _receive_requests(state, node):  # type: ignore[no-untyped-def]
         else:
             arrive(tags, node, request, now + delay, now)
         home.wake = min(home.wake, home.delay_ready)
+    # Packets of several sectors can come faster than one a cycle leaves: the delay has no bound.
+    if home.delay_count + level.width * machine.line_parts > state.l2.delay.shape[1]:
+        machine.lacks_room = 1
 
 
 @compiled
@@ -343,6 +346,7 @@ def _run(address, pause):  # type: ignore[no-untyped-def]
             return NEEDS_CTAS
         if (
             machine.free_top < machine.num_pool
+            or machine.lacks_room
             or is_filling_table(state.l2_route.draws)
             or is_filling_table(state.llc_route.draws)
         ):

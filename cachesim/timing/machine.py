@@ -484,13 +484,26 @@ def _with_room(route: Route) -> Route:
     return route._replace(draws=larger_draws(route.draws))
 
 
+def _with_longer_delays(tags: Tags) -> Tags:
+    instances, room = tags.delay.shape
+    longer = np.zeros((instances, 2 * room), records.WAITING)
+    for node in range(instances):
+        head, count = (int(tags.nodes[node][f"delay_{name}"]) for name in ("head", "count"))
+        longer[node, :count] = tags.delay[node, (head + np.arange(count)) % room]
+    tags.nodes["delay_head"] = 0
+    return tags._replace(delay=longer)
+
+
 def with_more_room(state: State) -> State:
-    """The same state with larger tables of drawn slices where they fill up, and twice as many
-    requests in its pool where that runs out.
+    """The same state with larger tables of drawn slices where they fill up, longer delays before
+    the L2 where one is full, and twice as many requests in its pool where that runs out.
     """
     state = state._replace(
         l2_route=_with_room(state.l2_route), llc_route=_with_room(state.llc_route)
     )
+    if state.pool.machine[0]["lacks_room"]:
+        state = state._replace(l2=_with_longer_delays(state.l2))
+        state.pool.machine[0]["lacks_room"] = 0
     pool = state.pool
     if pool.machine[0]["free_top"] >= pool.machine[0]["num_pool"]:
         return state

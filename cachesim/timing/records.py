@@ -431,7 +431,7 @@ MACHINE = np.dtype(
             # state
             "now", "tick", "tick_remainder", "free_top", "queued", "taken", "complete",
             "last_sm", "live_ctas", "age", "row_mask",
-            "request_mask", "in_flight",
+            "request_mask", "in_flight", "lacks_room",
             "place_from", "progress", "num_rows",
             "num_lane_fetches", "bank_conflicts", "instruction_threads", "has_gl1", "has_llc",
             "ctas_done", "trailer_first", "trailer_last", "queued_dram",
