@@ -47,9 +47,12 @@ def cache_folder(environment: dict[str, str]) -> str:
     return done.stdout.strip()
 
 
-def test_numba_caches_under_the_hash_unless_the_user_chose_a_folder(tmp_path: Path) -> None:
+def test_numba_caches_under_the_hash_in_the_users_folder_if_one_is_chosen(tmp_path: Path) -> None:
     environment = {k: v for k, v in os.environ.items() if k != "NUMBA_CACHE_DIR"}
     environment["XDG_CACHE_HOME"] = str(tmp_path)
     expected = tmp_path / "sss-cachesim" / source_hash(ROOT)
     assert cache_folder(environment) == str(expected)
-    assert cache_folder(environment | {"NUMBA_CACHE_DIR": "/chosen"}) == "/chosen"
+    chosen = Path("/chosen") / source_hash(ROOT)
+    assert cache_folder(environment | {"NUMBA_CACHE_DIR": "/chosen"}) == str(chosen)
+    # A process that was started with the folder keeps it.
+    assert cache_folder(environment | {"NUMBA_CACHE_DIR": str(chosen)}) == str(chosen)

@@ -27,11 +27,15 @@ def source_hash(root: Path) -> str:
 
 
 def use_cache_of_sources() -> None:
-    """Point numba at the folder of these sources, unless the user chose a folder.
+    """Point numba at the folder of these sources, inside the one that the user chose if so.
 
     Has an effect before numba is imported. Where the folder cannot be written, numba falls back on
     its own.
     """
-    if "NUMBA_CACHE_DIR" not in os.environ:
-        base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-        os.environ["NUMBA_CACHE_DIR"] = str(base / "sss-cachesim" / source_hash(_ROOT))
+    name = source_hash(_ROOT)
+    chosen = os.environ.get("NUMBA_CACHE_DIR")
+    if chosen and Path(chosen).name == name:
+        return  # A process that one of ours started.
+    base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    folder = Path(chosen) if chosen else base / "sss-cachesim"
+    os.environ["NUMBA_CACHE_DIR"] = str(folder / name)

@@ -158,22 +158,21 @@ def measure_kept(
         "method": method.as_dict(),
         "num_frames": num_frames,
         "reference": QUICK_REFERENCE_SAMPLES if quick else REFERENCE_SAMPLES,
+        "gpus": {name: gpu.model_dump(mode="json") for name, gpu in machines.items()},
     }
     words = "{scene}-{method}-{budget:g}".format(**shared)
-    cell = words.replace(", ", "-").replace(" ", "-")
-    quality = parts.json(
-        f"{cell}-quality",
-        inputs,
-        lambda: measure_quality(gbuffer, method, reference, num_frames, device),
+
+    def measure() -> list[dict[str, Any]]:
+        quality = measure_quality(gbuffer, method, reference, num_frames, device)
+        traffic = measure_traffic(gbuffer, method, list(machines.values()), num_frames, device)
+        return [
+            {"gpu": name, **quality, **found}
+            for name, found in zip(machines, traffic, strict=True)
+        ]
+
+    rows: list[dict[str, Any]] = parts.json(
+        words.replace(", ", "-").replace(" ", "-"), inputs, measure
     )
-    rows = []
-    for name, gpu in machines.items():
-
-        def count(gpu: Gpu = gpu) -> dict[str, Any]:
-            return measure_traffic(gbuffer, method, gpu, num_frames, device)
-
-        keyed = inputs | {"gpu": gpu.model_dump(mode="json")}
-        rows.append({"gpu": name, **quality, **parts.json(f"{cell}-{name}", keyed, count)})
     return rows
 
 
@@ -194,20 +193,24 @@ def measure_quality(
 
 
 def measure_traffic(
-    gbuffer: GBuffer, method: Method, gpu: Gpu, num_frames: int, device: Device
-) -> dict[str, Any]:
-    """Bytes asked of L1 and L2 and moved to and from DRAM by the last frame."""
-    from cachesim import simulate
+    gbuffer: GBuffer, method: Method, gpus: list[Gpu], num_frames: int, device: Device
+) -> list[dict[str, Any]]:
+    """Bytes asked of L1 and L2 and moved to and from DRAM by the last frame, on each GPU; the
+    frames are rendered once for all of them.
+    """
+    from cachesim import simulate_all
     from kernels.record import record
 
     trace = record(gbuffer, method, num_frames=num_frames, device=device, self_check=False)
-    report = simulate(trace, gpu)
-    return {
-        "lane_fetches": report.lane_fetches,
-        "l1_bytes": report.counters["l1"].demand_bytes,
-        "l2_bytes": report.counters["l2"].demand_bytes,
-        "dram_bytes": report.dram.bytes,
-    }
+    return [
+        {
+            "lane_fetches": report.lane_fetches,
+            "l1_bytes": report.counters["l1"].demand_bytes,
+            "l2_bytes": report.counters["l2"].demand_bytes,
+            "dram_bytes": report.dram.bytes,
+        }
+        for report in simulate_all(trace, gpus)
+    ]
 
 
 def compare_at_equal_quality(frame: pd.DataFrame) -> pd.DataFrame:
