@@ -166,8 +166,7 @@ def measure_kept(
         quality = measure_quality(gbuffer, method, reference, num_frames, device)
         traffic = measure_traffic(gbuffer, method, list(machines.values()), num_frames, device)
         return [
-            {"gpu": name, **quality, **found}
-            for name, found in zip(machines, traffic, strict=True)
+            {"gpu": name, **quality, **found} for name, found in zip(machines, traffic, strict=True)
         ]
 
     rows: list[dict[str, Any]] = parts.json(
