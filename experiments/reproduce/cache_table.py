@@ -159,7 +159,7 @@ EXPERIMENT = Experiment(
     title="Cycles, L1 and L2 demand and miss rates under GPGPU-Sim's TITAN X, fixed and adaptive",
     chapter="4",
     figure="slides: cycle-level analysis of bandwidth demands",
-    minutes=4,
+    minutes=3,
     quick_minutes=0.4,
     run=run,
 )

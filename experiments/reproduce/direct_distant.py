@@ -313,7 +313,7 @@ EXPERIMENT = Experiment(
     title="Direct and distant scattering apart: counts and convergence on a receding wall",
     chapter="4",
     figure="slides: separating direct and distant scattering",
-    minutes=12,
+    minutes=5,
     quick_minutes=0.2,
     run=run,
 )

@@ -288,7 +288,7 @@ EXPERIMENT = Experiment(
     title="Lighting and counts where there is no history, by rule: the circle scene",
     chapter="4",
     figure="slides: disocclusion",
-    minutes=10,
+    minutes=5,
     quick_minutes=0.15,
     run=run,
 )

@@ -276,7 +276,7 @@ EXPERIMENT = Experiment(
     title="TAA, local guiding and Separable under two intensities: PSNR against 1024 samples",
     chapter="4",
     figure="Fig. 2",
-    minutes=25,
+    minutes=35,
     quick_minutes=0.3,
     run=run,
 )

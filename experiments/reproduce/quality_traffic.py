@@ -287,7 +287,7 @@ EXPERIMENT = Experiment(
     title="FLIP and PSNR against L2 and DRAM bytes: a curve per method, a panel per GPU",
     chapter="3 to 6",
     figure="none: it sums the study up",
-    minutes=90,
+    minutes=100,
     quick_minutes=0.3,
     run=run,
 )
