@@ -64,5 +64,10 @@ def _scale(axes: Axes, which: str, values: pd.Series) -> None:
     (axes.set_xscale if which == "x" else axes.set_yscale)("log")
     axis = axes.xaxis if which == "x" else axes.yaxis
     axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.set_major_formatter(FuncFormatter(_short))
     axis.set_minor_formatter(NullFormatter())
+
+
+def _short(value: float, _: int) -> str:
+    """A tick's number; thousands as "5k", so that neighbours do not touch."""
+    return f"{value / 1000:g}k" if value >= 1000 else f"{value:g}"
