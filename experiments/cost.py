@@ -294,16 +294,18 @@ def prediction_table(predicted: Prediction, clock_hz: int, title: str) -> Table:
 
     from experiments.tables import Column, Table
 
-    rows: list[tuple[str, float | None, str]] = [
-        ("lane fetches", float(predicted.lane_fetches), ""),
-        ("samples", float(predicted.num_samples), ""),
+    rows: list[tuple[str, str, str]] = [
+        ("lane fetches", f"{predicted.lane_fetches:,}", ""),
+        ("samples", f"{predicted.num_samples:,}", ""),
     ]
-    rows += [(f"{k.upper()} demand", v / 1e6, "MB") for k, v in predicted.demand_bytes.items()]
+    rows += [
+        (f"{k.upper()} demand", f"{v / 1e6:,.2f}", "MB") for k, v in predicted.demand_bytes.items()
+    ]
     if predicted.cycles is not None:
-        rows.append(("cycles", predicted.cycles, ""))
-        rows.append(("time", predicted.cycles / clock_hz * 1e3, "ms"))
+        rows.append(("cycles", f"{predicted.cycles:,.0f}", ""))
+        rows.append(("time", f"{predicted.cycles / clock_hz * 1e3:.3f}", "ms"))
     frame = pd.DataFrame(rows, columns=["quantity", "value", "unit"])
     columns = (
-        Column("quantity", "quantity"), Column("value", "predicted", ",.3f"), Column("unit", "unit")
+        Column("quantity", "quantity"), Column("value", "predicted"), Column("unit", "unit")
     )  # fmt: skip
     return Table(f"{title} on {predicted.gpu}, predicted", frame, columns)
