@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from cachesim.config import Gpu
-    from experiments.reproduce.parts import Arrays, Parts
+    from experiments.reproduce.parts import Parts
     from kernels.device import Device
     from kernels.frame import Float
     from kernels.gbuffer import GBuffer
@@ -23,7 +23,10 @@ SCENES = ("close", "ear", "front")
 SIZE, QUICK_SIZE = (1920, 1080), (112, 63)
 FRAMES, QUICK_FRAMES = 32, 6
 REFERENCE_SAMPLES, QUICK_REFERENCE_SAMPLES = 1024, 256
-SOURCES = ("kernels", "cachesim", "traces", "experiments.reproduce.afis_vs_separable")
+SOURCES = (
+    "kernels", "cachesim", "traces", "experiments.reproduce.reference",
+    "experiments.reproduce.afis_vs_separable",
+)  # fmt: skip
 FIXED, ADAPTIVE, SEPARABLE, HYBRID = "AFIS, fixed 64", "AFIS, adaptive", "Separable", "hybrid"
 #: Slides, 1080p, Quadro P4000: milliseconds of the whole and PSNR in dB; facts sheet 3.6.
 PUBLISHED: dict[tuple[str, str], tuple[float, float | None]] = {
@@ -63,6 +66,8 @@ def run(settings: Settings) -> Outcome:
     from cachesim import presets
     from cachesim.first_use import compile_loops
     from experiments.reproduce.afis_vs_separable_plots import times_figure
+    from experiments.reproduce.reference import draw_reference
+    from kernels.method import Method
     from kernels.scene import load_scene
 
     settings.progress("rendering the scenes", 0.0)
@@ -72,10 +77,12 @@ def run(settings: Settings) -> Outcome:
     gpu = presets.load(GPU)
     compile_loops(timing=True)
     parts = settings.parts("afis-vs-separable", *SOURCES)
+    as_reference = Method(scale="legacy")
+    num_reference = QUICK_REFERENCE_SAMPLES if settings.quick else REFERENCE_SAMPLES
     rows: list[dict[str, Any]] = []
     methods = list_methods()
     for scene, gbuffer in gbuffers.items():
-        reference = draw_reference(gbuffer, settings.quick, parts, device)
+        reference = draw_reference(gbuffer, as_reference, num_reference, parts, device)
         for name, method in methods.items():
             done = len(rows) / (len(gbuffers) * len(methods))
             settings.progress(f"{scene}, {name}", 0.02 + 0.98 * done)
@@ -95,7 +102,7 @@ def run(settings: Settings) -> Outcome:
         words=(
             "Times are those of the timing model, all passes of one frame, with irradiance, "
             "normals and profile ids fetched. PSNR is on the shown luminance over the scattering "
-            f"pixels, against {QUICK_REFERENCE_SAMPLES if settings.quick else REFERENCE_SAMPLES} "
+            f"pixels, against {num_reference} "
             "samples per pixel from the finest mip: a reference of AFIS's own kind, as the "
             "paper's is. Separable is 27 taps of the same profile along each axis.",
             "One frame is judged, as it comes out of the combine pass. What the paper's frames "
@@ -106,22 +113,6 @@ def run(settings: Settings) -> Outcome:
             "of it.",
         ),
     )
-
-
-def draw_reference(gbuffer: GBuffer, quick: bool, parts: Parts, device: Device) -> Float:
-    """(h, w, 3) the picture that the methods are judged against."""
-    from experiments.p4000_study import digest
-    from kernels.method import Method
-    from kernels.quality import reference_image
-
-    count = QUICK_REFERENCE_SAMPLES if quick else REFERENCE_SAMPLES
-    method = Method(scale="legacy")
-
-    def draw() -> Arrays:
-        return {"image": reference_image(gbuffer, method, device, count)}
-
-    inputs = {"gbuffer": digest(gbuffer), "method": method.as_dict(), "samples": count}
-    return parts.arrays(f"reference-{gbuffer.name}", inputs, draw)["image"]
 
 
 def measure_kept(
@@ -137,6 +128,7 @@ def measure_kept(
 ) -> dict[str, Any]:
     """`measure`, read where it is finished."""
     from experiments.p4000_study import digest
+    from experiments.reproduce.parts import cell_name
 
     num_frames = (QUICK_FRAMES if quick else FRAMES) if method.adaptive else 1
     inputs = {
@@ -146,9 +138,10 @@ def measure_kept(
         "num_frames": num_frames,
         "reference": QUICK_REFERENCE_SAMPLES if quick else REFERENCE_SAMPLES,
     }
-    cell = f"{scene}-{name.replace(', ', '-').replace(' ', '-')}"
     found: dict[str, Any] = parts.json(
-        cell, inputs, lambda: measure(gbuffer, method, gpu, reference, num_frames, device)
+        cell_name(f"{scene}-{name}"),
+        inputs,
+        lambda: measure(gbuffer, method, gpu, reference, num_frames, device),
     )
     return found
 

@@ -30,7 +30,7 @@ SCENES = ("close", "ear", "front")
 SIZE, QUICK_SIZE = (960, 540), (192, 108)
 FRAMES, QUICK_FRAMES = 32, 6
 REFERENCE_SAMPLES, QUICK_REFERENCE_SAMPLES = 1024, 256
-SOURCES = ("kernels",)
+SOURCES = ("kernels", "experiments.reproduce.reference")
 UNSCATTERED, REFERENCE = "no scattering", "reference"
 #: Errors are shown this many times larger; details are this share of the frame's width.
 GAIN, DETAIL_RATE = 8.0, 0.2
@@ -85,17 +85,14 @@ def run(settings: Settings) -> Outcome:
 def draw_pictures(gbuffer: GBuffer, quick: bool, parts: Parts, device: Device) -> dict[str, Float]:
     """The finished pictures by method, the light without scattering first, the reference second."""
     from experiments.p4000_study import digest
+    from experiments.reproduce.parts import cell_name
+    from experiments.reproduce.reference import draw_reference
     from kernels.frame import render
-    from kernels.quality import reference_image
 
     methods = list_methods()
     num_frames = QUICK_FRAMES if quick else FRAMES
     num_reference = QUICK_REFERENCE_SAMPLES if quick else REFERENCE_SAMPLES
-    inputs = {"gbuffer": digest(gbuffer), "frames": num_frames, "reference": num_reference}
-
-    def draw_reference() -> Arrays:
-        base = methods["AFIS, 64 samples"]
-        return {"image": reference_image(gbuffer, base, device, num_reference)}
+    inputs = {"gbuffer": digest(gbuffer), "frames": num_frames}
 
     def draw(method: Method) -> Arrays:
         count = num_frames if method.adaptive else 1
@@ -103,10 +100,12 @@ def draw_pictures(gbuffer: GBuffer, quick: bool, parts: Parts, device: Device) -
 
     pictures = {
         UNSCATTERED: gbuffer.irradiance * gbuffer.albedo + gbuffer.non_subsurface,
-        REFERENCE: parts.arrays(f"{gbuffer.name}-reference", inputs, draw_reference)["image"],
+        REFERENCE: draw_reference(
+            gbuffer, methods["AFIS, 64 samples"], num_reference, parts, device
+        ),
     }
     for name, method in methods.items():
-        cell = f"{gbuffer.name}-{name.replace(', ', '-').replace(' ', '-')}"
+        cell = cell_name(f"{gbuffer.name}-{name}")
         keyed = inputs | {"method": method.as_dict()}
         pictures[name] = parts.arrays(cell, keyed, partial(draw, method))["image"]
     return pictures

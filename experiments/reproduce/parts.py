@@ -28,6 +28,11 @@ _SUFFIXES = (".py", ".cl", ".h", ".toml", ".json", ".cu")
 _ROOT = Path(__file__).resolve().parents[2]
 
 
+def cell_name(words: str) -> str:
+    """Words as the name of a cell's file: "AFIS, fixed, 64" is "AFIS-fixed-64"."""
+    return words.replace(", ", "-").replace(" ", "-")
+
+
 class Parts:
     """The cells of one experiment.
 

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from cachesim.config import Gpu
-    from experiments.reproduce.parts import Arrays, Parts
+    from experiments.reproduce.parts import Parts
     from kernels.device import Device
     from kernels.frame import Float
     from kernels.gbuffer import GBuffer
@@ -28,7 +28,10 @@ SCENES, QUICK_SCENES = ("close", "ear", "front"), ("front",)
 SIZE, QUICK_SIZE = (1920, 1080), (160, 90)
 FRAMES, QUICK_FRAMES = 32, 6
 REFERENCE_SAMPLES, QUICK_REFERENCE_SAMPLES = 1024, 512
-SOURCES = ("kernels", "cachesim", "traces", "experiments.reproduce.quality_traffic")
+SOURCES = (
+    "kernels", "cachesim", "traces", "experiments.reproduce.reference",
+    "experiments.reproduce.quality_traffic",
+)  # fmt: skip
 UNFILTERED, FIXED, ADAPTIVE, SEPARABLE, HYBRID = (
     "AFIS, fixed, no mips",
     "AFIS, fixed",
@@ -69,6 +72,8 @@ def run(settings: Settings) -> Outcome:
     from cachesim import presets
     from cachesim.first_use import compile_loops
     from experiments.reproduce.quality_traffic_plots import traffic_figure
+    from experiments.reproduce.reference import draw_reference
+    from kernels.method import Method
     from kernels.scene import load_scene
 
     settings.progress("rendering the scenes", 0.0)
@@ -78,12 +83,14 @@ def run(settings: Settings) -> Outcome:
     machines = {name: presets.load(name) for name in GPUS}
     compile_loops(timing=False)
     parts = settings.parts("quality-traffic", *SOURCES)
+    as_reference = Method(scale="legacy")
+    num_reference = QUICK_REFERENCE_SAMPLES if settings.quick else REFERENCE_SAMPLES
     budgets = [(f, b, m) for f, own in list_methods(settings.quick).items() for b, m in own]
     rows: list[dict[str, Any]] = []
     total = len(scenes) * len(budgets)
     for scene in scenes:
         gbuffer = load_scene(scene, width, height, device=device)
-        reference = draw_reference(gbuffer, settings.quick, parts, device)
+        reference = draw_reference(gbuffer, as_reference, num_reference, parts, device)
         for family, budget, method in budgets:
             share = len(rows) / (total * len(machines))
             settings.progress(f"{scene}, {family}, {budget:g}", 0.02 + 0.98 * share)
@@ -116,27 +123,11 @@ def run(settings: Settings) -> Outcome:
             f"{QUICK_FRAMES if settings.quick else FRAMES}, judged by itself, not blended.",
             "PSNR is on the shown luminance, FLIP on the picture clipped to [0, 1] at 67 pixels "
             "per degree, both against "
-            f"{QUICK_REFERENCE_SAMPLES if settings.quick else REFERENCE_SAMPLES} samples per pixel "
+            f"{num_reference} samples per pixel "
             "from the finest mip. The DRAM of the GPUs whose caches hold the whole frame moves "
             "each texel once, whatever the method; small frames fit in every L2.",
         ),
     )
-
-
-def draw_reference(gbuffer: GBuffer, quick: bool, parts: Parts, device: Device) -> Float:
-    """(h, w, 3) the picture that the methods are judged against."""
-    from experiments.p4000_study import digest
-    from kernels.method import Method
-    from kernels.quality import reference_image
-
-    count = QUICK_REFERENCE_SAMPLES if quick else REFERENCE_SAMPLES
-    method = Method(scale="legacy")
-
-    def draw() -> Arrays:
-        return {"image": reference_image(gbuffer, method, device, count)}
-
-    inputs = {"gbuffer": digest(gbuffer), "method": method.as_dict(), "samples": count}
-    return parts.arrays(f"reference-{gbuffer.name}", inputs, draw)["image"]
 
 
 def measure_kept(
@@ -151,6 +142,7 @@ def measure_kept(
 ) -> list[dict[str, Any]]:
     """A row per GPU: the quality and the bytes of one method's frame, read where finished."""
     from experiments.p4000_study import digest
+    from experiments.reproduce.parts import cell_name
 
     num_frames = (QUICK_FRAMES if quick else FRAMES) if method.adaptive else 1
     inputs = {
@@ -160,7 +152,6 @@ def measure_kept(
         "reference": QUICK_REFERENCE_SAMPLES if quick else REFERENCE_SAMPLES,
         "gpus": {name: gpu.model_dump(mode="json") for name, gpu in machines.items()},
     }
-    words = "{scene}-{method}-{budget:g}".format(**shared)
 
     def measure() -> list[dict[str, Any]]:
         quality = measure_quality(gbuffer, method, reference, num_frames, device)
@@ -170,7 +161,7 @@ def measure_kept(
         ]
 
     rows: list[dict[str, Any]] = parts.json(
-        words.replace(", ", "-").replace(" ", "-"), inputs, measure
+        cell_name("{scene}-{method}-{budget:g}".format(**shared)), inputs, measure
     )
     return rows
 

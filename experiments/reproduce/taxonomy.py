@@ -29,7 +29,10 @@ GPU, SCENE = "quadro-p4000", "front"
 SIZE, QUICK_SIZE = (1920, 1080), (160, 90)
 FRAMES, QUICK_FRAMES = 32, 6
 REFERENCE_SAMPLES, QUICK_REFERENCE_SAMPLES = 1024, 256
-SOURCES = ("kernels", "cachesim", "traces", "experiments.reproduce.demand_maps")
+SOURCES = (
+    "kernels", "cachesim", "traces", "experiments.reproduce.reference",
+    "experiments.reproduce.demand_maps",
+)  # fmt: skip
 #: The passes in which light scatters; the others are the same work for every method.
 SCATTERING = ("sampling", "separable_h", "separable_v")
 HOMOGENEOUS, HETEROGENEOUS = "homogeneous", "+ technique per tile"
@@ -58,7 +61,7 @@ def run(settings: Settings) -> Outcome:
     from cachesim.first_use import compile_loops
     from experiments.p4000_study import digest
     from experiments.reproduce.demand_maps import DemandMaps, demand_figure
-    from kernels.quality import reference_image
+    from experiments.reproduce.reference import draw_reference
     from kernels.scene import load_scene
 
     settings.progress("rendering the scene", 0.0)
@@ -75,11 +78,7 @@ def run(settings: Settings) -> Outcome:
     inputs = {"gbuffer": digest(gbuffer), "num_frames": num_frames}
     compile_loops(timing=True)
     settings.progress(f"reference, {num_reference} samples per pixel", 0.05)
-    reference = parts.arrays(
-        "reference",
-        inputs | {"samples": num_reference},
-        lambda: {"image": reference_image(gbuffer, methods[HOMOGENEOUS], device, num_reference)},
-    )["image"]
+    reference = draw_reference(gbuffer, methods[HOMOGENEOUS], num_reference, parts, device)
     rows, maps = [], {}
     for done, (name, method) in enumerate(methods.items()):
         settings.progress(name, 0.1 + 0.9 * done / len(methods))
