@@ -6,6 +6,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from recordings import assert_launches_equal
 
 from kernels.capture import load_exr, load_npz, save_exr, save_npz
 from kernels.classify import radius_at_cm
@@ -97,18 +98,7 @@ def test_trace_and_pictures_equal_the_reference(device, name):
         chunk_bytes=1 << 16,
         self_check=False,
     )
-    launches = [found for frame in expected for found in frame.launches]
-    chunks = list(trace.chunks())
-    assert [v.pass_name for v in trace.launches] == [step.pass_name for step, _, _ in launches]
-    for number, (step, offsets, lanes) in enumerate(launches):
-        assert trace.launches[number].num_ctas == step.grid.num_ctas
-        mine = [chunk for chunk in chunks if chunk.launch == number]
-        if not step.grid.num_ctas:
-            assert not mine
-            continue
-        rows = np.concatenate([np.diff(chunk.warp_offsets) for chunk in mine])
-        assert np.array_equal(rows, np.diff(offsets)), step.pass_name
-        assert np.array_equal(np.concatenate([c.lanes for c in mine]), lanes), step.pass_name
+    assert_launches_equal(trace, [found for frame in expected for found in frame.launches])
     check(trace)
     last = expected[-1]
     frame = render(gbuffer, method, NUM_FRAMES, device)

@@ -6,6 +6,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from recordings import assert_launches_equal
 
 from kernels import program
 from kernels.frame import render
@@ -68,20 +69,13 @@ def test_trace_and_pictures_equal_the_reference(device, name, scene):
         self_check=False,
     )
     launches = [
-        (frame, step, offsets, lanes)
+        (frame, launch)
         for frame, found in enumerate(expected)
-        for step, offsets, lanes in found.launches
-        if step.pass_name in method.passes
+        for launch in found.launches
+        if launch[0].pass_name in method.passes
     ]
-    chunks = list(trace.chunks())
-    assert [(v.frame, v.pass_name) for v in trace.launches] == [
-        (frame, step.pass_name) for frame, step, _, _ in launches
-    ]
-    for number, (_, step, offsets, lanes) in enumerate(launches):
-        mine = [chunk for chunk in chunks if chunk.launch == number]
-        rows = np.concatenate([np.diff(chunk.warp_offsets) for chunk in mine])
-        assert np.array_equal(rows, np.diff(offsets)), step.pass_name
-        assert np.array_equal(np.concatenate([c.lanes for c in mine]), lanes), step.pass_name
+    assert [v.frame for v in trace.launches] == [frame for frame, _ in launches]
+    assert_launches_equal(trace, [launch for _, launch in launches])
 
     last, textures = expected[-1], expected[-1].textures
     frame = render(gbuffer, method, NUM_FRAMES, device)

@@ -6,6 +6,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from recordings import assert_launches_equal
 
 from kernels import pipeline as pipelines
 from kernels import program
@@ -52,13 +53,7 @@ def assert_equals_reference(gbuffer, method, device, num_frames=2):
         chunk_bytes=1 << 16,
         self_check=False,
     )
-    chunks = list(trace.chunks())
-    launches = [found for frame in expected for found in frame.launches]
-    for number, (step, offsets, lanes) in enumerate(launches):
-        mine = [chunk for chunk in chunks if chunk.launch == number]
-        rows = np.concatenate([np.diff(chunk.warp_offsets) for chunk in mine])
-        assert np.array_equal(rows, np.diff(offsets)), step.pass_name
-        assert np.array_equal(np.concatenate([c.lanes for c in mine]), lanes), step.pass_name
+    assert_launches_equal(trace, [found for frame in expected for found in frame.launches])
     check(trace)
     frame = render(gbuffer, method, num_frames, device)
     assert np.array_equal(to_half(frame.combined), expected[-1].textures["output"][..., :3])

@@ -6,6 +6,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+from recordings import assert_launches_equal
 
 from kernels import taa
 from kernels.analytic import Circle
@@ -93,13 +94,7 @@ def test_trace_and_pictures_equal_the_reference(device, name, scene):
         for launch in found.launches
         if launch[0].pass_name in method.passes
     ]
-    chunks = list(trace.chunks())
-    assert [v.pass_name for v in trace.launches] == [step.pass_name for step, _, _ in launches]
-    for number, (step, offsets, lanes) in enumerate(launches):
-        mine = [chunk for chunk in chunks if chunk.launch == number]
-        rows = np.concatenate([np.diff(chunk.warp_offsets) for chunk in mine])
-        assert np.array_equal(rows, np.diff(offsets)), step.pass_name
-        assert np.array_equal(np.concatenate([c.lanes for c in mine]), lanes), step.pass_name
+    assert_launches_equal(trace, launches)
 
     textures = expected[-1].textures
     frame = render(gbuffer, method, NUM_FRAMES, device)
