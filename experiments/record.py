@@ -21,6 +21,10 @@ from experiments.options import (
 FILE_BYTES_PER_LANE = (0.25, 1.0)
 OUTPUT_HELP = "The recording."
 FRAMES_HELP = "Frames to render, which build up the history."
+INSTRUCTIONS_HELP = (
+    "Whose machine code the arithmetic is taken from: sm_61, sm_75, sm_90, gfx1010 or gfx1030, "
+    "exact as the kernels run here, or with -native behind it as a shader's compiler has it."
+)
 TRACED_HELP = "Which frames to record: the last, all, or a list of numbers from 0."
 
 
@@ -78,15 +82,20 @@ def command(
     passes: options.Passes = None,
     tile_order: options.TileOrder = "raster",
     lane_map: options.LaneMap = "linear",
+    instructions: Annotated[
+        str, typer.Option("--instructions", metavar="NAME", help=INSTRUCTIONS_HELP)
+    ] = "sm_61-native",
 ) -> None:
     """Render a scene and record every texel fetch into a Parquet file."""
     from experiments.console import progress, remark
     from experiments.options import parse_image_size, scene_arguments
     from experiments.output import output_file
+    from kernels.instruction_counts.data import check_target
 
     output_file(output, ".parquet")
     width, height = parse_image_size(size)
     mesh = scene_arguments(scene, camera, albedo_map, normal_map)
+    check_target(instructions)
     traced_frames = parse_traced_frames(traced, frames)
     chosen = options.make_method(
         {
@@ -151,7 +160,12 @@ def command(
         f"about {low:,.1f} to {high:,.1f} MB"
     )
     trace = record_trace(
-        view, chosen, num_frames=frames, traced_frames=traced_frames, device=opened
+        view,
+        chosen,
+        num_frames=frames,
+        traced_frames=traced_frames,
+        device=opened,
+        instruction_target=instructions,
     )
     num_fetches = 0
 

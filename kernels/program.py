@@ -60,16 +60,20 @@ def lanes_per_item(device: Device, kernel: str) -> int:
 
 
 @cache
-def source(name: str) -> str:
-    """The text of a program: "other", or that of a pass with a loop."""
+def source(name: str, native: bool = False) -> str:
+    """The text of a program: "other", or that of a pass with a loop. native: with the functions of
+    native.cl in place of polynomial.cl's; such a text is counted, not run.
+    """
     folder = resources.files("kernels")
-    texts = [folder.joinpath(f"{file}.cl").read_text() for file in _FILES[name]]
+    files = ["native" if native and file == "polynomial" else file for file in _FILES[name]]
+    texts = [folder.joinpath(f"{file}.cl").read_text() for file in files]
     return "\n".join([*([_PREFIX[name]] if name in _PREFIX else []), *texts])
 
 
-def source_hash() -> str:
-    """SHA-256 of the kernels' text, for the manifest of a trace."""
-    return hashlib.sha256("".join(map(source, _FILES)).encode()).hexdigest()
+def source_hash(native: bool = False) -> str:
+    """SHA-256 of the kernels' text, for the manifest of a trace. native: see `source`."""
+    text = "".join(source(name, native) for name in _FILES)
+    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def macros(method: Method, traced: bool) -> tuple[str, ...]:

@@ -132,6 +132,7 @@ BAD_TRACE_COMMANDS = [
     (["record", "-o", "t.parquet", "--passes", "setup,smpling"], ["'smpling'", "'sampling'"]),
     (["record", "-o", "t.parquet", "--mip-rule", "eq"], ["'eq'", "eq-5.12", "mip0"]),
     (["record", "-o", "t.parquet", "--camera", "ear"], ["--camera", "mesh"]),
+    (["record", "-o", "t.parquet", "--instructions", "sm_6"], ["sm_6", "sm_61-native"]),
     (["record", "-o", "t.parquet", "--nonsense"], ["--nonsense"]),
     (["rnu", "T"], ["'rnu'", "'run'"]),
 ]

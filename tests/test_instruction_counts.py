@@ -10,10 +10,9 @@ import pytest
 
 from kernels import program
 from kernels.grid import Grid
-from kernels.instruction_counts.compile import TARGETS as COMPILED_TARGETS
 from kernels.instruction_counts.compile import Toolchain
 from kernels.instruction_counts.count import accesses_of, count_kernel
-from kernels.instruction_counts.data import TARGETS, counts_of, read
+from kernels.instruction_counts.data import INSTRUCTION_SETS, TARGETS, counts_of, read, split_target
 from kernels.instruction_counts.machine import CHARGED_KINDS
 from kernels.instruction_counts.segments import total
 from kernels.instruction_counts.variants import KERNELS, all_variants, macros_of
@@ -42,11 +41,21 @@ def test_every_kernel_and_variant_is_counted(target):
 @pytest.mark.parametrize("target", TARGETS)
 def test_the_counts_are_those_of_the_present_kernels(target):
     """After a change of a .cl file: python -m kernels.instruction_counts.count."""
-    assert read(target)["kernel_source_sha256"] == program.source_hash()
+    _, native = split_target(target)
+    assert read(target)["kernel_source_sha256"] == program.source_hash(native)
 
 
-def test_what_can_be_compiled_is_what_can_be_read():
-    assert COMPILED_TARGETS == TARGETS
+@pytest.mark.parametrize("instruction_set", INSTRUCTION_SETS)
+def test_native_arithmetic_takes_fewer_instructions_but_more_of_the_special_function_units(
+    instruction_set,
+):
+    for method in (Method(), Method(inverse_cdf="exact"), Method(kind="adaptive")):
+        exact, native = (
+            total(counts_of("sampling", method, target).loop)
+            for target in (instruction_set, f"{instruction_set}-native")
+        )
+        assert sum(native.values()) < 0.7 * sum(exact.values())
+        assert native["sfu"] > exact["sfu"]
 
 
 @pytest.mark.parametrize("target", TARGETS)
@@ -207,8 +216,9 @@ def test_a_recount_gives_the_committed_counts(toolchain, target):
     if toolchain.versions(target) != content["compilers"]:
         pytest.skip(f"other compilers than the committed ones: {toolchain.versions(target)}")
     method = Method()
+    _, native = split_target(target)
     for kernel in ("setup", "sampling"):
-        text = program.source(KERNELS[kernel][0])
+        text = program.source(KERNELS[kernel][0], native)
         compiled = toolchain.compile(text, target, macros_of(method))[kernel]
         (name,) = [n for n, m in all_variants(kernel).items() if macros_of(m) == macros_of(method)]
         entry = count_kernel(compiled, text, kernel, accesses_of(kernel, method))

@@ -78,6 +78,14 @@ def test_devices_compute_the_same_bits(device, width):
     text = resources.files("kernels").joinpath("polynomial.cl").read_text() + _KERNEL
     x = log_uniform(1e-6, 80)
     turns = RANDOM.integers(0, 1 << 32, COUNT, dtype=np.uint32)
+    found = run(device, text, width, x, turns)
+    names = ("log", "exp", "cbrt", "gamma", "cos", "sin")
+    for name, got, want in zip(names, found, computed(x, turns), strict=True):
+        assert np.array_equal(got.view(np.uint32), want.view(np.uint32)), name
+
+
+def run(device, text, width, x, turns):
+    """What a text's functions make of the numbers, a row per function."""
     flags = cl.mem_flags.READ_ONLY | cl.mem_flags.COPY_HOST_PTR
     sources = [cl.Buffer(device.context, flags, hostbuf=array) for array in (x, turns)]
     target = cl.Buffer(device.context, cl.mem_flags.WRITE_ONLY, 6 * x.nbytes)
@@ -85,13 +93,34 @@ def test_devices_compute_the_same_bits(device, width):
     program.run(device.queue, (COUNT,), None, *sources, target)
     found = np.empty((6, COUNT), np.float32)
     cl.enqueue_copy(device.queue, found, target)
-    expected = [
+    return found
+
+
+def computed(x, turns):
+    """The same by NumPy."""
+    return [
         polynomial.poly_log(x),
         polynomial.poly_exp(-x),
         polynomial.poly_cbrt(x),
         polynomial.poly_gamma(x),
         *polynomial.poly_cos_sin(turns),
     ]
-    names = ("log", "exp", "cbrt", "gamma", "cos", "sin")
-    for name, got, want in zip(names, found, expected, strict=True):
-        assert np.array_equal(got.view(np.uint32), want.view(np.uint32)), name
+
+
+@pytest.mark.opencl
+def test_the_native_twins_compute_the_same_functions(device):
+    """They are only counted: here the device's built-in functions stand for the units."""
+    from importlib import resources
+
+    units = """
+    #define UNIT_LOG2 native_log2
+    #define UNIT_EXP2 native_exp2
+    #define UNIT_COS(turns) native_cos((turns) * 0x1.921fb6p+2f)
+    #define UNIT_SIN(turns) native_sin((turns) * 0x1.921fb6p+2f)
+    """
+    text = resources.files("kernels").joinpath("native.cl").read_text() + _KERNEL
+    x = log_uniform(1e-6, 80)
+    turns = RANDOM.integers(0, 1 << 32, COUNT, dtype=np.uint32)
+    found = run(device, "\n".join(line.strip() for line in units.splitlines()) + text, 1, x, turns)
+    for got, want in zip(found, computed(x, turns), strict=True):
+        assert np.abs(got - want).max() < 1e-4 * max(1, np.abs(want).max())

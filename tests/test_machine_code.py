@@ -224,7 +224,8 @@ def test_rdna_code_is_read():
     assert kinds == ["control", "sfu", "sfu", "", "memory", "fp32", "control", "memory", "control"]
     argument, product, _, wait, load, _, branch_back, store, _ = kernel.instructions
     assert argument.arguments == (("s0", 8), ("s1", 12), ("s2", 16), ("s3", 20))
-    assert product.reads == ("v2", "s8", "v0", "v1")  # s1 takes the carry.
+    # s1 takes the carry; of the addend only the low word decides the low word of the address.
+    assert product.reads == ("v2", "s8", "v0")
     assert wait.waits == ((0, 1),)
     assert load.address == ("v0", "v1", "s2", "s3") and load.barrier == 0
     assert kernel.labels[branch_back.target] == 4

@@ -100,6 +100,9 @@ def _decode(text: str) -> MachineInstruction:
     if opcode.startswith("s_load_"):
         offset = int(operands[2], 0)
         arguments = tuple((register, offset + 4 * k) for k, register in enumerate(written))
+    if opcode.startswith("v_mad_u64"):
+        # The result's low word has nothing of the addend's high one, which may be left over.
+        operands[-1] = (*_registers(operands[-1]), operands[-1])[0]
     limit = _FIELD.search(rest) if opcode == "s_waitcnt" else None
     target = operands[0] if opcode.startswith(("s_cbranch", "s_branch")) else ""
     address: list[str] = (

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from kernels.instruction_counts import amd, nvidia
+from kernels.instruction_counts.data import split_target
 from kernels.instruction_counts.machine import CountError, MachineCode
 
 #: libclc converts to and from half precision with integer instructions; every GPU here, and so its
@@ -37,19 +38,38 @@ void store_texel(float4 value, size_t index, __global half *memory)
 #define vload_half4 load_texel
 #define vstore_half4_rte store_texel
 """
+#: What native.cl asks for, as each vendor's compiler makes of the built-in functions of a shader.
+#: NVIDIA's unit takes radians.
+_NATIVE_PRELUDE = {
+    "sm": """
+#define UNIT_LOG2 __nvvm_lg2_approx_ftz_f
+#define UNIT_EXP2 __nvvm_ex2_approx_ftz_f
+#define UNIT_COS(turns) __nvvm_cos_approx_ftz_f((turns) * 0x1.921fb6p+2f)
+#define UNIT_SIN(turns) __nvvm_sin_approx_ftz_f((turns) * 0x1.921fb6p+2f)
+""",
+    "gf": """
+#define UNIT_LOG2 __builtin_amdgcn_logf
+#define UNIT_EXP2 __builtin_amdgcn_exp2f
+#define UNIT_COS __builtin_amdgcn_cosf
+#define UNIT_SIN __builtin_amdgcn_sinf
+""",
+}
 _OPTIONS = (
     "-x cl -cl-std=CL1.2 -O3 -w -Xclang -cl-ext=+cl_khr_fp16 -Xclang -finclude-default-header "
-    "-Xclang -fdeclare-opencl-builtins -cl-fp32-correctly-rounded-divide-sqrt"
+    "-Xclang -fdeclare-opencl-builtins"
 ).split()
-#: Clang's options for each target, and libclc's library.
-_TARGETS = {
+_EXACT_OPTIONS = ("-cl-fp32-correctly-rounded-divide-sqrt",)
+#: Approximate quotients and roots, products and sums in one instruction, denormals flushed: what
+#: shaders get.
+_NATIVE_OPTIONS = ("-cl-fast-relaxed-math", "-cl-denorms-are-zero")
+#: Clang's options for each instruction set, and libclc's library.
+_INSTRUCTION_SETS = {
     "sm_61": ("-target nvptx64--nvidiacl -Xclang -target-cpu -Xclang sm_61", "nvptx64--nvidiacl"),
     "sm_75": ("-target nvptx64--nvidiacl -Xclang -target-cpu -Xclang sm_75", "nvptx64--nvidiacl"),
     "sm_90": ("-target nvptx64--nvidiacl -Xclang -target-cpu -Xclang sm_90", "nvptx64--nvidiacl"),
     "gfx1010": ("-target amdgcn-amd-amdhsa -mcpu=gfx1010 -nogpulib", "gfx1010-amdgcn--"),
     "gfx1030": ("-target amdgcn-amd-amdhsa -mcpu=gfx1030 -nogpulib", "gfx1030-amdgcn--"),
 }
-TARGETS = tuple(_TARGETS)
 #: The environment variable that names a folder with the tools.
 TOOLCHAIN = "CACHESIM_TOOLCHAIN"
 
@@ -78,7 +98,8 @@ class Toolchain:
 
     def versions(self, target: str) -> dict[str, str]:
         """The version of each tool that takes part."""
-        library = (self.libclc / f"{_TARGETS[target][1]}.bc").read_bytes()
+        instruction_set, _ = split_target(target)
+        library = (self.libclc / f"{_INSTRUCTION_SETS[instruction_set][1]}.bc").read_bytes()
         found = {
             "clang": _version(self.clang, r"version (\S+)"),
             "libclc_sha256": hashlib.sha256(library).hexdigest(),
@@ -89,20 +110,24 @@ class Toolchain:
         return found
 
     def compile(self, text: str, target: str, macros: Sequence[str] = ()) -> dict[str, MachineCode]:
-        """The machine code of every kernel in an OpenCL program.
+        """The machine code of every kernel in an OpenCL program. For a native target the text is
+        that of `program.source(..., native=True)`.
 
         Raises:
             CountError: a tool failed, or its output is not understood.
         """
-        options, library = _TARGETS[target]
+        instruction_set, native = split_target(target)
+        options, library = _INSTRUCTION_SETS[instruction_set]
+        prelude = _PRELUDE + _NATIVE_PRELUDE[target[:2]] if native else _PRELUDE
         with tempfile.TemporaryDirectory() as name:
             folder = Path(name)
             source, assembly, binary = (folder / f"kernels.{e}" for e in ("cl", "s", "cubin"))
-            source.write_text(_PRELUDE + text)
+            source.write_text(prelude + text)
             bitcode = str(self.libclc / f"{library}.bc")
             _run(
                 self.clang,
                 *_OPTIONS,
+                *(_NATIVE_OPTIONS if native else _EXACT_OPTIONS),
                 *options.split(),
                 *("-Xclang", "-mlink-builtin-bitcode", "-Xclang", bitcode),
                 *macros,
@@ -112,11 +137,11 @@ class Toolchain:
                 return amd.read_code(assembly.read_text())
             messages = _run(
                 self.ptxas,
-                *(f"-arch={target}", "-O3", "--fmad=false", "-v", str(assembly)),
-                *("-o", str(binary)),
+                *(f"-arch={instruction_set}", "-O3", f"--fmad={str(native).lower()}"),
+                *("-v", str(assembly), "-o", str(binary)),
             )
             disassembly = _run(self.nvdisasm, "-hex", str(binary))
-            return nvidia.read_code(disassembly, target, messages)
+            return nvidia.read_code(disassembly, instruction_set, messages)
 
 
 def _run(*command: str) -> str:

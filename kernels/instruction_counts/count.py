@@ -16,8 +16,8 @@ from typing import Any
 
 from kernels import estimate, program
 from kernels.access import Access
-from kernels.instruction_counts.compile import TARGETS, TOOLCHAIN, Toolchain
-from kernels.instruction_counts.data import data_file
+from kernels.instruction_counts.compile import TOOLCHAIN, Toolchain
+from kernels.instruction_counts.data import TARGETS, data_file, split_target
 from kernels.instruction_counts.flow import Flow, Way
 from kernels.instruction_counts.machine import CountError, MachineCode
 from kernels.instruction_counts.segments import Segment, Walk, to_text
@@ -148,10 +148,11 @@ def count_target(toolchain: Toolchain, target: str) -> dict[str, Any]:
     Raises:
         CountError: a tool failed, or its output is not understood.
     """
+    _, native = split_target(target)
     compiled: dict[tuple[str, tuple[str, ...]], dict[str, MachineCode]] = {}
     kernels: dict[str, dict[str, Any]] = {}
     for kernel, (name, _) in KERNELS.items():
-        text = program.source(name)
+        text = program.source(name, native)
         kernels[kernel] = {}
         for variant, method in all_variants(kernel).items():
             key = name, macros_of(method)
@@ -166,7 +167,7 @@ def count_target(toolchain: Toolchain, target: str) -> dict[str, Any]:
     return {
         "target": target,
         "compilers": toolchain.versions(target),
-        "kernel_source_sha256": program.source_hash(),
+        "kernel_source_sha256": program.source_hash(native),
         "kernels": kernels,
     }
 

@@ -14,9 +14,16 @@ from kernels.method import Method
 from traces.errors import unknown
 
 #: The instruction sets that are counted: GPUs of the presets.
-TARGETS = ("sm_61", "sm_75", "sm_90", "gfx1010", "gfx1030")
-#: The dissertation's GPUs are Pascal.
-DEFAULT_TARGET = "sm_61"
+INSTRUCTION_SETS = ("sm_61", "sm_75", "sm_90", "gfx1010", "gfx1030")
+#: Each with the kernels' own exact arithmetic, and with a shader's native one.
+TARGETS = tuple(name for isa in INSTRUCTION_SETS for name in (isa, f"{isa}-native"))
+#: The dissertation's GPUs are Pascal, and its passes are shaders.
+DEFAULT_TARGET = "sm_61-native"
+
+
+def split_target(target: str) -> tuple[str, bool]:
+    """(instruction set, whether native) of a target."""
+    return target.removesuffix("-native"), target.endswith("-native")
 
 
 @dataclass(frozen=True)
@@ -40,6 +47,14 @@ class Counts:
     after: tuple[Segment, ...]
 
 
+def check_target(target: str) -> None:
+    """Raises:
+    InputError: it is not counted.
+    """
+    if target not in TARGETS:
+        raise unknown("instruction target", target, TARGETS, "recording")
+
+
 def data_file(target: str) -> Path:
     """The file that holds a target's counts."""
     return Path(__file__).parent / "data" / f"{target}.json"
@@ -52,8 +67,7 @@ def read(target: str) -> dict[str, Any]:
     Raises:
         InputError: there is none.
     """
-    if target not in TARGETS:
-        raise unknown("instruction_target", target, TARGETS, "recording")
+    check_target(target)
     content: dict[str, Any] = json.loads(data_file(target).read_text(encoding="utf-8"))
     return content
 
@@ -73,4 +87,14 @@ def describe(target: str) -> dict[str, Any]:
     return {"target": content["target"], "compilers": content["compilers"]}
 
 
-__all__ = ["DEFAULT_TARGET", "TARGETS", "Counts", "counts_of", "data_file", "describe", "read"]
+__all__ = [
+    "DEFAULT_TARGET",
+    "TARGETS",
+    "Counts",
+    "check_target",
+    "counts_of",
+    "data_file",
+    "describe",
+    "read",
+    "split_target",
+]
