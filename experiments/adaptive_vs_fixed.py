@@ -28,8 +28,8 @@ if TYPE_CHECKING:
     from cachesim.config import Gpu
     from cachesim.report import Part
     from cachesim.timing.results import TimingResult
-    from kernels.device import Device
     from kernels.gbuffer import GBuffer
+    from kernels.opencl.device import Device
 
 METHODS = ("fixed", "adaptive")
 #: Of which passes a number is: of all that are traced, or of the sampling pass alone.

@@ -19,9 +19,9 @@ from cachesim import Report, presets, simulate
 from cachesim.first_use import compile_loops
 from experiments.bench import row_name
 from experiments.options import parse_image_size
-from kernels.device import open_device
 from kernels.gbuffer import GBuffer
 from kernels.method import Method
+from kernels.opencl.device import open_device
 from kernels.record import record
 from kernels.scene import load_scene
 from traces.parquet import write_parquet

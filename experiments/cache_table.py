@@ -36,8 +36,8 @@ def command(
     from experiments.options import parse_image_size
     from experiments.output import output_folder, write_figure, write_text
     from experiments.tables import print_table, write_table
-    from kernels.device import open_device
     from kernels.method import Method
+    from kernels.opencl.device import open_device
     from kernels.scene import load_scene
 
     width, height = parse_image_size(size)

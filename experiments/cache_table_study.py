@@ -27,8 +27,8 @@ if TYPE_CHECKING:
     from cachesim import Report
     from cachesim.config import Gpu
     from cachesim.report import LevelCounters
-    from kernels.device import Device
     from kernels.gbuffer import GBuffer
+    from kernels.opencl.device import Device
 
 FETCH_PATHS = ("texture", "readonly", "global")
 METHODS = ("fixed", "adaptive")

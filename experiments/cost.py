@@ -206,7 +206,7 @@ def _predict(
     settings = options.make_method(fields)
     if frames < 1:
         raise InputError(f"--frames {frames}: allowed are 1 and more")
-    from kernels.device import open_device
+    from kernels.opencl.device import open_device
     from kernels.scene import load_scene
 
     with progress("rendering the scene") as bar:

@@ -27,12 +27,12 @@ from traces.trace import WAIT
 
 if TYPE_CHECKING:
     from kernels.access import Access, Program
-    from kernels.device import Device
     from kernels.frame import Scene
     from kernels.gbuffer import GBuffer
     from kernels.grid import Grid
+    from kernels.launches import Step
     from kernels.method import Method
-    from kernels.passes import Step
+    from kernels.opencl.device import Device
 
 
 def scene_workload(
@@ -192,7 +192,7 @@ class _Maker:
 
     def _loop(self, step: Step) -> tuple[Any, Any, Any, Any]:
         """(num_warps,) turns of the loop, samples and scattering pixels; (num_warps, 32) counts."""
-        from kernels import taa
+        from kernels.passes import taa
 
         grid = step.grid
         if step.pass_name == "prefilter":

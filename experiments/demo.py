@@ -71,7 +71,7 @@ def command(
     timed = machines_to_time(machines, timing)
     with clock.stage("loading the libraries"):
         from experiments import adaptive_vs_fixed as study
-        from kernels.device import open_device
+        from kernels.opencl.device import open_device
         from kernels.scene import load_scene
 
     def of_mesh(name: str) -> dict[str, Any]:

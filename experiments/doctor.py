@@ -14,7 +14,7 @@ def command(
 ) -> None:
     """Explain OpenCL on this machine; exits with 1 where no device works."""
     from experiments.console import console, remark
-    from kernels.doctor import diagnose, install_fallback, print_diagnosis
+    from kernels.opencl.doctor import diagnose, install_fallback, print_diagnosis
 
     diagnosis = install_fallback(remark) if install else diagnose()
     print_diagnosis(diagnosis, console())

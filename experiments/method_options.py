@@ -184,8 +184,8 @@ def make_method(fields: dict[str, Any]) -> Method:
     Raises:
         InputError: a field has a value that is not allowed, or a pass that the method does not run.
     """
+    from kernels.launches import names_run
     from kernels.method import Method
-    from kernels.passes import names_run
 
     fields = {name: value for name, value in fields.items() if value is not None}
     for name in ("planes", "passes", "hybrid_rules"):

@@ -30,8 +30,8 @@ if TYPE_CHECKING:
     from cachesim import Report
     from cachesim.config import Gpu
     from cachesim.timing.results import PassTiming
-    from kernels.device import Device
     from kernels.gbuffer import GBuffer
+    from kernels.opencl.device import Device
 
 Cell = dict[str, Any]
 Counts = npt.NDArray[np.uint16]

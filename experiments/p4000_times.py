@@ -62,7 +62,7 @@ def command(
 
     machine = presets.load(gpu, overrides)
     from experiments import p4000_study as study
-    from kernels.device import open_device
+    from kernels.opencl.device import open_device
     from kernels.scene import load_scene
 
     folder = output_folder(output)

@@ -44,7 +44,7 @@ def command(
 
     from cachesim import presets
     from experiments import prefilter_effect as study
-    from kernels.device import open_device
+    from kernels.opencl.device import open_device
     from kernels.scene import load_scene
 
     machine = presets.load(gpu, overrides)

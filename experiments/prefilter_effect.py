@@ -22,8 +22,8 @@ from kernels.record import record
 if TYPE_CHECKING:
     from cachesim import Report
     from cachesim.config import Gpu
-    from kernels.device import Device
     from kernels.gbuffer import GBuffer
+    from kernels.opencl.device import Device
 
 COUNTS = (8, 16, 64)
 SCALES = ("legacy", "physical")

@@ -141,8 +141,8 @@ def command(
             "lane_map": lane_map,
         }
     )
-    from kernels.device import open_device
     from kernels.frame import gbuffer_of
+    from kernels.opencl.device import open_device
     from kernels.record import estimate_rows
     from kernels.record import record as record_trace
     from kernels.scene import open_scene

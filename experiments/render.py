@@ -96,9 +96,9 @@ def command(
     )
     folder = output_folder(output)
     from experiments.plots import count_map
-    from kernels.device import open_device
     from kernels.frame import gbuffer_of
     from kernels.frame import render as render_frames
+    from kernels.opencl.device import open_device
     from kernels.picture import preview, save_png, tone_map
     from kernels.scene import open_scene
 

@@ -1,4 +1,9 @@
-"""The OpenCL side: scenes, G-buffers and the subsurface passes."""
+"""The OpenCL side: scenes, G-buffers and the subsurface passes.
+
+scenes ──► gbuffer ──► frame: pipeline of launches ──► record: a Trace
+                        passes, a module and a `.cl` each, over maths, on opencl's device
+                        reference: the same in NumPy; dense: the sum over every texel
+"""
 
 import os
 

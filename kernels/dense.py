@@ -23,11 +23,11 @@ import numpy as np
 import numpy.typing as npt
 
 from kernels import resources
-from kernels.device import Device, open_device
 from kernels.gbuffer import GBuffer
+from kernels.maths.profile import cdf
 from kernels.method import Method
-from kernels.profile import cdf
-from kernels.sampling import Constants
+from kernels.opencl.device import Device, open_device
+from kernels.passes.sampling import Constants
 from traces.errors import InputError
 
 if TYPE_CHECKING:
@@ -237,7 +237,9 @@ def _kernel(device: Device, macros: tuple[str, ...]) -> cl.Kernel:
     import pyopencl as cl
 
     folder = files.files("kernels")
-    text = "\n".join(folder.joinpath(f"{name}.cl").read_text() for name in ("polynomial", "dense"))
+    text = "\n".join(
+        folder.joinpath(name).read_text() for name in ("maths/polynomial.cl", "dense.cl")
+    )
     return cl.Kernel(device.build(text, macros), "dense")
 
 

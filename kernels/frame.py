@@ -10,10 +10,10 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from kernels import taa, update
-from kernels.device import Device, open_device
 from kernels.gbuffer import GBuffer
 from kernels.method import Method
+from kernels.opencl.device import Device, open_device
+from kernels.passes import taa, update
 from kernels.pipeline import Pipeline
 from traces.errors import InputError
 

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import pyopencl as cl
 
-from kernels.device import Device
+from kernels.opencl.device import Device
 from traces.texture import WARP_SIZE
 
 _PAGE_BYTES = 4096

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from kernels.profile import SKIN, Profile
-from kernels.sequence import HASHES
+from kernels.maths.profile import SKIN, Profile
+from kernels.maths.sequence import HASHES
 from traces.errors import InputError, unknown
 
 PLANES = ("colour", "normal", "profile_id")

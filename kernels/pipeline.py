@@ -11,14 +11,15 @@ import numpy as np
 import numpy.typing as npt
 import pyopencl as cl
 
-from kernels import classify, estimate, pilot, program, resources, sampling, separable, taa
+from kernels import program, resources
 from kernels.access import States
-from kernels.device import Device
 from kernels.gbuffer import GBuffer
 from kernels.grid import WARPS_PER_CTA, Grid, lane_table
+from kernels.launches import PASSES, Step, list_steps
 from kernels.method import Method
-from kernels.passes import PASSES, Step, list_steps
-from kernels.separable_taps import make_taps
+from kernels.opencl.device import Device
+from kernels.passes import classify, estimate, pilot, sampling, separable, taa
+from kernels.passes.separable_taps import make_taps
 from kernels.tiles import CLASS_OF_PASS, ListedGrid, count_tiles
 from traces.errors import InputError
 from traces.texture import WARP_SIZE

@@ -9,22 +9,22 @@ from functools import cache
 from importlib import resources
 from typing import TYPE_CHECKING
 
-from kernels.device import Device
+from kernels.maths.sequence import HASHES
 from kernels.method import Method
-from kernels.sequence import HASHES
+from kernels.opencl.device import Device
 
 if TYPE_CHECKING:
     import pyopencl as cl
 
-#: Each program's files, in the order in which they need each other. The passes with a loop stand
-#: alone: their work-items hold more lanes.
+#: Each program's files behind the functions of `maths`, in the order in which they need each other.
+#: The passes with a loop stand alone: their work-items hold more lanes.
 _FILES = {
-    "sampling": ("polynomial", "common", "patch", "work_items", "sampling"),
-    "pilot": ("polynomial", "common", "patch", "work_items", "sampling"),
-    "separable_h": ("polynomial", "common", "patch", "work_items", "separable"),
-    "separable_v": ("polynomial", "common", "patch", "work_items", "separable"),
+    "sampling": ("common", "patch", "work_items", "sampling"),
+    "pilot": ("common", "patch", "work_items", "sampling"),
+    "separable_h": ("common", "patch", "work_items", "separable"),
+    "separable_v": ("common", "patch", "work_items", "separable"),
     "other": (
-        *("polynomial", "common", "history", "covariance"),
+        *("common", "history", "covariance"),
         *("setup", "prefilter", "classify", "estimate", "update", "combine"),
         *("overlay", "taa"),
     ),
@@ -64,9 +64,12 @@ def source(name: str, native: bool = False) -> str:
     """The text of a program: "other", or that of a pass with a loop. native: with the functions of
     native.cl in place of polynomial.cl's; such a text is counted, not run.
     """
-    folder = resources.files("kernels")
-    files = ["native" if native and file == "polynomial" else file for file in _FILES[name]]
-    texts = [folder.joinpath(f"{file}.cl").read_text() for file in files]
+    maths = resources.files("kernels.maths").joinpath("native.cl" if native else "polynomial.cl")
+    folder = resources.files("kernels.passes")
+    texts = [
+        maths.read_text(),
+        *(folder.joinpath(f"{file}.cl").read_text() for file in _FILES[name]),
+    ]
     return "\n".join([*([_PREFIX[name]] if name in _PREFIX else []), *texts])
 
 

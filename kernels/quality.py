@@ -10,10 +10,10 @@ import math
 import numpy as np
 import numpy.typing as npt
 
-from kernels.device import Device
 from kernels.frame import Float, render
 from kernels.gbuffer import GBuffer
 from kernels.method import Method
+from kernels.opencl.device import Device
 from traces.errors import InputError
 
 #: Rec. 709 luminance of linear RGB.

@@ -16,16 +16,17 @@ from typing import Any
 
 import numpy as np
 
-from kernels import pilot, program, resources, separable, taa
+from kernels import program, resources
 from kernels.access import Offsets, Program, States
-from kernels.device import Device, open_device
 from kernels.frame import Progress, Scene, advance, check_num_frames, gbuffer_of
 from kernels.gbuffer import GBuffer
 from kernels.grid import WARPS_PER_CTA, Grid
 from kernels.instruction_counts.data import DEFAULT_TARGET, describe
 from kernels.lanes import ROW_BYTES, LaneBuffer, LanePool
+from kernels.launches import Step, list_steps
 from kernels.method import Method
-from kernels.passes import Step, list_steps
+from kernels.opencl.device import Device, open_device
+from kernels.passes import pilot, separable, taa
 from kernels.pipeline import Pipeline, TraceTarget
 from kernels.selfcheck import count_differences
 from traces.errors import InputError

@@ -14,24 +14,24 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from kernels import (
+from kernels import resources
+from kernels.gbuffer import GBuffer
+from kernels.grid import Grid
+from kernels.launches import Step, list_steps
+from kernels.method import Method
+from kernels.passes import (
     classify,
     combine,
     estimate,
     overlay,
     pilot,
     prefilter,
-    resources,
     sampling,
     separable,
     setup,
     taa,
     update,
 )
-from kernels.gbuffer import GBuffer
-from kernels.grid import Grid
-from kernels.method import Method
-from kernels.passes import Step, list_steps
 from kernels.tiles import CLASS_OF_PASS, ListedGrid
 from traces.texture import WARP_SIZE
 

@@ -6,15 +6,15 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from kernels.analytic import circle, wall
-from kernels.camera import CAMERAS, Camera, camera_named, check_size
 from kernels.gbuffer import GBuffer
-from kernels.light import RIG, Rig
+from kernels.scenes.analytic import circle, wall
+from kernels.scenes.camera import CAMERAS, Camera, camera_named, check_size
+from kernels.scenes.light import RIG, Rig
 from traces.errors import InputError, unknown
 
 if TYPE_CHECKING:
-    from kernels.device import Device
     from kernels.frame import Scene
+    from kernels.opencl.device import Device
 
 CIRCLE, WALL = "circle", "wall"
 SCENES: tuple[str, ...] = (*CAMERAS, CIRCLE, WALL)
@@ -44,7 +44,7 @@ def open_scene(
     if str(name_or_path) == CIRCLE:
         scene = circle(first.width, first.height)
     if overlay and first.overlay is None:
-        from kernels.motion import Overlaid, veil
+        from kernels.scenes.motion import Overlaid, veil
 
         return Overlaid(scene, veil())
     return scene
@@ -98,13 +98,13 @@ def load_scene(
         _refuse(name, {"camera": camera}, False, "the head or a mesh")
         return circle(width, height)(0) if name == CIRCLE else wall(width, height)
     if is_mesh:
-        from kernels.mesh_render import render_mesh
+        from kernels.scenes.mesh_render import render_mesh
 
         view = "front" if camera is None else camera
         return render_mesh(
             name, width, height, camera=view, rig=rig, progress=progress, **mesh_options
         )
-    from kernels.head import render_head
+    from kernels.scenes.head import render_head
 
     if isinstance(camera, str) and camera != name:
         raise InputError(
@@ -117,7 +117,7 @@ def load_scene(
 def _capture(
     path: Path, suffix: str, width: int | None, height: int | None, projection_x: float | None
 ) -> GBuffer:
-    from kernels.capture import load_exr, load_npz
+    from kernels.scenes.capture import load_exr, load_npz
 
     gbuffer = (load_npz if suffix == ".npz" else load_exr)(path, projection_x)
     wanted = (width or gbuffer.width, height or gbuffer.height)

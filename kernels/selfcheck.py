@@ -7,9 +7,9 @@ from __future__ import annotations
 import numpy as np
 import pyopencl as cl
 
-from kernels.device import Device
 from kernels.gbuffer import GBuffer
 from kernels.method import Method
+from kernels.opencl.device import Device
 from kernels.pipeline import Pipeline, TraceTarget
 from kernels.reference import render_reference
 from traces.texture import WARP_SIZE

@@ -21,7 +21,7 @@ hypothesis.settings.load_profile("ci" if os.environ.get("CI") else "default")
 @functools.cache
 def working_devices():
     """Every device that runs the probe kernel, opened once for the whole session."""
-    from kernels.device import all_devices
+    from kernels.opencl.device import all_devices
 
     return tuple(all_devices())
 
@@ -56,7 +56,7 @@ def first_device():
     """The device that runs where none is named, for what the comparisons with the reference hold
     every device to.
     """
-    from kernels.device import open_device
+    from kernels.opencl.device import open_device
 
     return open_device()
 

@@ -19,7 +19,7 @@ from cachesim.cost.workload import (
     Sweep,
     Workload,
 )
-from kernels.profile import SKIN
+from kernels.maths.profile import SKIN
 from traces.texture import Texture
 
 GPU = "quadro-p4000"

@@ -6,9 +6,9 @@ import os
 import numpy as np
 import pytest
 
-from kernels.capture import CHANNELS, PLANES, load_exr, load_npz, save_exr, save_npz
 from kernels.gbuffer import GBuffer
 from kernels.scene import load_scene
+from kernels.scenes.capture import CHANNELS, PLANES, load_exr, load_npz, save_exr, save_npz
 from traces.errors import InputError, WorkError
 
 OpenEXR = pytest.importorskip("OpenEXR")

@@ -7,9 +7,9 @@ import dataclasses
 import numpy as np
 import pytest
 
-from kernels import covariance
 from kernels.frame import gbuffer_of, render
 from kernels.method import Method
+from kernels.passes import covariance
 from kernels.pipeline import Pipeline
 from kernels.record import record
 from kernels.reference import render_reference

@@ -18,8 +18,8 @@ from cachesim.cost.workload import (
     Workload,
     taps_mm,
 )
-from kernels.profile import SKIN, inverse_cdf_approximate
-from kernels.separable_taps import make_taps
+from kernels.maths.profile import SKIN, inverse_cdf_approximate
+from kernels.passes.separable_taps import make_taps
 
 
 def test_distances_are_the_samplers_and_none_lies_in_its_own_pixel():

@@ -7,13 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from kernels.analytic import wall
 from kernels.dense import combine_densely, reach_mm, reference, scatter_densely
 from kernels.frame import render
+from kernels.maths.profile import cdf
 from kernels.method import Method
-from kernels.profile import cdf
-from kernels.separable_taps import line_share
-from kernels.sphere import sphere
+from kernels.passes.separable_taps import line_share
+from kernels.scenes.analytic import wall
+from kernels.scenes.sphere import sphere
 from traces.errors import InputError
 
 EXACT = Method(inverse_cdf="exact", mip_rule="mip0", prefilter=False, scale="legacy")

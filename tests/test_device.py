@@ -1,4 +1,4 @@
-"""kernels.device: which device is chosen, what is built on it, how one that fails is reported."""
+"""kernels.opencl.device: which device is chosen, what is built on it, how failures are told."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from kernels import device as device_module
-from kernels.device import CORRECT_ROUNDING, DeviceError, Probe, open_device
-from kernels.driver_noise import noise_kept, short_reason
+from kernels.opencl import device as device_module
+from kernels.opencl.device import CORRECT_ROUNDING, DeviceError, Probe, open_device
+from kernels.opencl.driver_noise import noise_kept, short_reason
 from traces.errors import InputError
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -129,7 +129,7 @@ def test_the_first_device_that_works_is_taken_and_the_failures_before_it_are_pas
 
 
 def test_a_driver_that_lists_a_device_but_cannot_compile_is_named_with_its_reason(without_opencl):
-    code = "from kernels.device import open_device; open_device()"
+    code = "from kernels.opencl.device import open_device; open_device()"
     done = subprocess.run(
         [sys.executable, "-c", code], env=without_opencl, cwd=ROOT, capture_output=True, text=True
     )

@@ -1,4 +1,4 @@
-"""kernels.doctor: OpenCL explained, and a CPU device installed where none works."""
+"""kernels.opencl.doctor: OpenCL explained, and a CPU device installed where none works."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from types import SimpleNamespace
 import pytest
 from rich.console import Console
 
-from kernels import device as device_module
-from kernels import doctor
-from kernels.device import DeviceError, Probe, open_device
+from kernels.opencl import device as device_module
+from kernels.opencl import doctor
+from kernels.opencl.device import DeviceError, Probe, open_device
 
 ROOT = Path(__file__).resolve().parents[1]
 POPEN = subprocess.Popen

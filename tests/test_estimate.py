@@ -8,18 +8,19 @@ from collections import deque
 import numpy as np
 import pytest
 
-from kernels import estimate, program
+from kernels import program
 from kernels.access import Access
 from kernels.frame import render
-from kernels.history import (
+from kernels.maths.profile import cdf
+from kernels.method import Method
+from kernels.passes import estimate
+from kernels.passes.history import (
     mask_of,
     mean_of_past,
     names_of,
     oldest_of_past,
     push_count,
 )
-from kernels.method import Method
-from kernels.profile import cdf
 from kernels.record import record
 from kernels.reference import render_reference
 from kernels.selfcheck import count_differences, small_gbuffer
@@ -119,7 +120,7 @@ def test_the_variance_between_samples_predicts_that_between_frames(device):
 @pytest.mark.parametrize("weights", ["self-normalised", "mean"])
 def test_the_spread_is_the_variance_of_a_ratio_of_sums(weights):
     """Against the formula over all samples, in double precision."""
-    from kernels.spread import find_spread
+    from kernels.passes.spread import find_spread
 
     rng = np.random.default_rng(3)
     n = 12
@@ -187,7 +188,7 @@ def test_estimators_without_history_put_samples_where_the_light_changes(device, 
 
 
 def test_the_distant_share_is_what_the_profile_scatters_beyond_the_pixel():
-    from kernels.sampling import Constants
+    from kernels.passes.sampling import Constants
 
     method = Method()
     constants = Constants.of(method, 1920, 1080, 3.732)

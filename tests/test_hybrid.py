@@ -8,16 +8,16 @@ import numpy as np
 import pytest
 from recordings import assert_launches_equal
 
-from kernels.capture import load_exr, load_npz, save_exr, save_npz
-from kernels.classify import radius_at_cm
 from kernels.frame import advance, render
 from kernels.grid import Grid
 from kernels.method import Method
+from kernels.passes.classify import radius_at_cm
+from kernels.passes.sampling import Constants
 from kernels.pipeline import Pipeline
 from kernels.record import estimate_rows, record
 from kernels.reference import render_reference
 from kernels.resources import TEXTURE_NAMES, to_half
-from kernels.sampling import Constants
+from kernels.scenes.capture import load_exr, load_npz, save_exr, save_npz
 from kernels.selfcheck import count_differences, small_gbuffer
 from kernels.tiles import (
     CLASS_OF_PASS,

@@ -1,4 +1,4 @@
-"""kernels.icd: the drivers of the machine and of the environment are seen together."""
+"""kernels.opencl.icd: the drivers of the machine and of the environment are seen together."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from kernels import icd
+from kernels.opencl import icd
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -89,7 +89,9 @@ def test_the_users_own_vendors_are_left_alone_and_ours_are_replaced(machine, mon
 def test_a_device_works_where_the_users_cache_cannot_be_written(device, tmp_path):
     (tmp_path / "file").touch()
     home = str(tmp_path / "file")
-    code = f"from kernels.device import open_device; print(open_device({device.name!r}).name)"
+    code = (
+        f"from kernels.opencl.device import open_device; print(open_device({device.name!r}).name)"
+    )
     variables = ("OCL_ICD_VENDORS", "POCL_CACHE_DIR")
     environment = {name: value for name, value in os.environ.items() if name not in variables}
     done = subprocess.run(

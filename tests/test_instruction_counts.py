@@ -16,8 +16,8 @@ from kernels.instruction_counts.data import INSTRUCTION_SETS, TARGETS, counts_of
 from kernels.instruction_counts.machine import CHARGED_KINDS
 from kernels.instruction_counts.segments import total
 from kernels.instruction_counts.variants import KERNELS, all_variants, macros_of
+from kernels.launches import PASSES, list_steps
 from kernels.method import PLANES, Method
-from kernels.passes import PASSES, list_steps
 from kernels.record import record
 from kernels.resources import TEXTURE_NAMES
 from kernels.selfcheck import small_gbuffer

@@ -105,7 +105,7 @@ def test_self_check_counts_nothing_on_a_complying_device(device):
 
 
 def test_self_check_notices_a_difference(device, monkeypatch):
-    from kernels import sampling
+    from kernels.passes import sampling
 
     monkeypatch.setattr(sampling, "_C", np.float32(2.6))
     assert count_differences(device, Method(num_samples=6)) > 0

@@ -6,7 +6,7 @@ import numpy as np
 import pyopencl as cl
 import pytest
 
-from kernels import polynomial
+from kernels.maths import polynomial
 
 RANDOM = np.random.default_rng(20200501)
 COUNT = 20_000
@@ -75,7 +75,7 @@ def test_cosine_and_sine_over_the_whole_turn():
 def test_devices_compute_the_same_bits(device, width):
     from importlib import resources
 
-    text = resources.files("kernels").joinpath("polynomial.cl").read_text() + _KERNEL
+    text = resources.files("kernels.maths").joinpath("polynomial.cl").read_text() + _KERNEL
     x = log_uniform(1e-6, 80)
     turns = RANDOM.integers(0, 1 << 32, COUNT, dtype=np.uint32)
     found = run(device, text, width, x, turns)
@@ -118,7 +118,7 @@ def test_the_native_twins_compute_the_same_functions(device):
     #define UNIT_COS(turns) native_cos((turns) * 0x1.921fb6p+2f)
     #define UNIT_SIN(turns) native_sin((turns) * 0x1.921fb6p+2f)
     """
-    text = resources.files("kernels").joinpath("native.cl").read_text() + _KERNEL
+    text = resources.files("kernels.maths").joinpath("native.cl").read_text() + _KERNEL
     x = log_uniform(1e-6, 80)
     turns = RANDOM.integers(0, 1 << 32, COUNT, dtype=np.uint32)
     found = run(device, "\n".join(line.strip() for line in units.splitlines()) + text, 1, x, turns)

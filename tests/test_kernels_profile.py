@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from kernels import estimate, profile, sampling
+from kernels.maths import profile
+from kernels.maths.profile import SKIN, Profile
+from kernels.maths.sequence import pcg3d16, r2
 from kernels.method import Method
-from kernels.profile import SKIN, Profile
-from kernels.sequence import pcg3d16, r2
+from kernels.passes import estimate, sampling
 from traces.errors import InputError
 
 XI = np.arange(0.0005, 1, 0.0005)

@@ -8,12 +8,12 @@ import pytest
 import trimesh
 from PIL import Image
 
-from kernels import mesh_render
-from kernels.camera import Camera
-from kernels.light import Light, Rig
-from kernels.mesh import load_mesh
-from kernels.mesh_render import render_mesh
 from kernels.scene import load_scene
+from kernels.scenes import mesh_render
+from kernels.scenes.camera import Camera
+from kernels.scenes.light import Light, Rig
+from kernels.scenes.mesh import load_mesh
+from kernels.scenes.mesh_render import render_mesh
 from traces.errors import InputError
 
 DARK = (0.0, 0.0, 0.0)

@@ -12,12 +12,12 @@ from PIL import Image
 
 from experiments import method_options
 from experiments.cli import run_command
-from kernels.analytic import Circle
+from kernels.launches import names_run
 from kernels.method import PASSES, Method
-from kernels.motion import Overlaid, veil
-from kernels.passes import names_run
 from kernels.picture import preview
 from kernels.record import record
+from kernels.scenes.analytic import Circle
+from kernels.scenes.motion import Overlaid, veil
 from traces.errors import InputError
 from traces.open import open_trace
 

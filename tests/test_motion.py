@@ -8,18 +8,18 @@ import math
 import numpy as np
 import pytest
 
-from kernels.analytic import Circle, wall
-from kernels.camera import CAMERAS, Camera
 from kernels.frame import render
-from kernels.head import render_head
-from kernels.jitter import CUT, SIGMA, Jitter, radical_inverse
-from kernels.light import RIG
+from kernels.maths.profile import SKIN, cdf
 from kernels.method import Method
-from kernels.motion import MovingScene, Overlaid, Relit, veil
-from kernels.paths import dolly, flash, orbit, pulse, rotate, still, swing, switched
-from kernels.profile import SKIN, cdf
+from kernels.scenes.analytic import Circle, wall
+from kernels.scenes.camera import CAMERAS, Camera
+from kernels.scenes.head import render_head
+from kernels.scenes.jitter import CUT, SIGMA, Jitter, radical_inverse
+from kernels.scenes.light import RIG
+from kernels.scenes.motion import MovingScene, Overlaid, Relit, veil
+from kernels.scenes.paths import dolly, flash, orbit, pulse, rotate, still, swing, switched
+from kernels.scenes.velocity import BEHIND, camera_velocity
 from kernels.selfcheck import small_gbuffer
-from kernels.velocity import BEHIND, camera_velocity
 from traces.errors import InputError
 
 WIDTH, HEIGHT = 96, 54

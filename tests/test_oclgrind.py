@@ -26,7 +26,7 @@ BROKEN_KERNELS = {
 RUN_BROKEN = """
 import sys
 import pyopencl as cl
-from kernels.device import open_device
+from kernels.opencl.device import open_device
 device = open_device()
 buffer = cl.Buffer(device.context, cl.mem_flags.READ_WRITE, 32)
 device.build(sys.argv[1]).run(device.queue, (8,), (8,), buffer)
@@ -37,8 +37,8 @@ device.queue.finish()
 # grid a quarter as fine.
 RENDER_HEAD = """
 import re
-from kernels import head
-from kernels.camera import CAMERAS
+from kernels.scenes import head
+from kernels.scenes.camera import CAMERAS
 
 text = head.source()
 text, sides = re.subn(r"(?m)^(#define GRID_[XYZ]) (\\d+)$",

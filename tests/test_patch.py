@@ -14,7 +14,7 @@ from kernels.access import scattering_tiles
 from kernels.frame import render
 from kernels.grid import Grid
 from kernels.method import Method
-from kernels.patch import patch_texels
+from kernels.passes.patch import patch_texels
 from kernels.record import estimate_rows, record
 from kernels.reference import render_reference
 from kernels.resources import to_half

@@ -22,11 +22,11 @@ from experiments.reproduce import (
 )
 from experiments.reproduce.experiment import Settings
 from experiments.reproduce.film_plots import Panel, line_figure, map_figure
-from kernels.analytic import Circle
-from kernels.estimate import estimate_count
 from kernels.frame import render
 from kernels.method import Method
+from kernels.passes.estimate import estimate_count
 from kernels.quality import reference_image
+from kernels.scenes.analytic import Circle
 from kernels.selfcheck import small_gbuffer
 
 # The film.
@@ -261,7 +261,7 @@ def test_the_slides_rule_spares_samples_where_nothing_is_known(first_device):
 
 
 def test_the_border_is_where_a_twentieth_leaves_the_pixel():
-    from kernels.profile import SKIN, cdf
+    from kernels.maths.profile import SKIN, cdf
 
     at = direct_distant.border_column(640)
     near, far = direct_distant.NEAR, direct_distant.FAR

@@ -159,7 +159,7 @@ def test_the_generations_verdict_counts_where_it_holds():
 
 @pytest.mark.opencl
 def test_the_taxonomy_lowers_samples_and_levels_rise(tmp_path):
-    from kernels.device import open_device
+    from kernels.opencl.device import open_device
     from kernels.scene import load_scene
 
     device = open_device()

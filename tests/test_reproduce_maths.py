@@ -12,7 +12,7 @@ from scipy.stats import qmc
 from experiments.reproduce import cv_toy, point_sets, sampling_function, sampling_sequence
 from experiments.reproduce import cv_toy_model as toy
 from experiments.reproduce.experiment import Settings
-from kernels import profile
+from kernels.maths import profile
 
 
 def test_the_printed_constant_is_the_minimiser_of_the_cdf_error():

@@ -22,9 +22,9 @@ from experiments.reproduce import (
 )
 from experiments.reproduce.experiment import Settings
 from experiments.reproduce.ground_truth_volume import Compared
-from kernels.camera import Camera
-from kernels.separable_taps import line_share
-from kernels.sphere import sphere
+from kernels.passes.separable_taps import line_share
+from kernels.scenes.camera import Camera
+from kernels.scenes.sphere import sphere
 from traces.errors import InputError, WorkError
 
 

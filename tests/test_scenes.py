@@ -6,15 +6,15 @@ import hashlib
 import numpy as np
 import pytest
 
-from kernels import head
-from kernels.analytic import Circle, wall
-from kernels.camera import CAMERAS, Camera
-from kernels.device import open_device
 from kernels.frame import advance, start_pipeline
-from kernels.light import RIG, Light, Rig
 from kernels.method import Method
+from kernels.opencl.device import open_device
 from kernels.picture import preview, save_png, tone_map
 from kernels.scene import load_scene, open_scene
+from kernels.scenes import head
+from kernels.scenes.analytic import Circle, wall
+from kernels.scenes.camera import CAMERAS, Camera
+from kernels.scenes.light import RIG, Light, Rig
 from traces.errors import InputError
 
 PLANES = ("irradiance", "albedo", "non_subsurface", "depth_cm", "normal", "profile_id")

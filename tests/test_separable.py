@@ -11,13 +11,9 @@ from scipy.integrate import quad
 
 from kernels.frame import render
 from kernels.gbuffer import GBuffer
+from kernels.maths.profile import SKIN, evaluate
 from kernels.method import Method
-from kernels.profile import SKIN, evaluate
-from kernels.record import estimate_rows, record
-from kernels.reference import render_reference
-from kernels.resources import to_half
-from kernels.selfcheck import count_differences, small_gbuffer
-from kernels.separable_taps import (
+from kernels.passes.separable_taps import (
     SKIN_FALLOFF,
     SKIN_STRENGTH,
     line_share,
@@ -25,6 +21,10 @@ from kernels.separable_taps import (
     skin_profile,
     unit_offsets,
 )
+from kernels.record import estimate_rows, record
+from kernels.reference import render_reference
+from kernels.resources import to_half
+from kernels.selfcheck import count_differences, small_gbuffer
 from traces.check import check
 from traces.errors import InputError
 from traces.texture import unpack_texel

@@ -8,18 +8,18 @@ import numpy as np
 import pytest
 from recordings import assert_launches_equal
 
-from kernels import taa
-from kernels.analytic import Circle
 from kernels.frame import render
 from kernels.gbuffer import GBuffer
 from kernels.grid import Grid
-from kernels.jitter import Jitter
 from kernels.method import Method
-from kernels.motion import Overlaid, veil
+from kernels.passes import taa
 from kernels.quality import psnr, reference_image
 from kernels.record import record
 from kernels.reference import render_reference
 from kernels.resources import to_half
+from kernels.scenes.analytic import Circle
+from kernels.scenes.jitter import Jitter
+from kernels.scenes.motion import Overlaid, veil
 from kernels.selfcheck import small_gbuffer
 from traces.errors import InputError
 

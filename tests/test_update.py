@@ -7,11 +7,11 @@ import dataclasses
 import numpy as np
 import pytest
 
-from kernels import update
 from kernels.frame import render
 from kernels.grid import Grid
 from kernels.method import Method
-from kernels.sampling import Constants
+from kernels.passes import update
+from kernels.passes.sampling import Constants
 from kernels.selfcheck import small_gbuffer
 
 F = np.float32

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 
 from cachesim import Report, simulate
-from kernels.capture import save_npz
 from kernels.gbuffer import GBuffer
 from kernels.method import Method
 from kernels.record import record
+from kernels.scenes.capture import save_npz
 
 
 def main(folder: Path, width: int = 960, height: int = 540) -> Report:

@@ -17,9 +17,9 @@ from experiments.reproduce.experiment import Experiment, Outcome, Settings
 if TYPE_CHECKING:
     from experiments.reproduce.film import Float, Mask
     from experiments.reproduce.parts import Arrays
-    from kernels.device import Device
     from kernels.gbuffer import GBuffer
     from kernels.method import Method
+    from kernels.opencl.device import Device
 
 SCENE = "close"
 SIZE, QUICK_SIZE = (640, 360), (128, 72)
@@ -262,7 +262,7 @@ def measure_overlay(gbuffer: GBuffer, plain: Method, frames: int, device: Device
     veil.
     """
     from experiments.reproduce.film import play, rms, tracked
-    from kernels.motion import Overlaid, veil
+    from kernels.scenes.motion import Overlaid, veil
 
     height, width = gbuffer.depth_cm.shape
     draw = veil(speed_pixels=2 * width / frames, opacity=0.8)
@@ -308,7 +308,7 @@ class GlobalGuide:
         """(h, w) float32: the next frame's count. picture, shown: tracked scalars of this frame as
         finished and as the TAA shows it.
         """
-        from kernels.estimate import estimate_count
+        from kernels.passes.estimate import estimate_count
 
         alpha, rest = np.float32(self._method.alpha), np.float32(1 - self._method.alpha)
         if self._shown is None:

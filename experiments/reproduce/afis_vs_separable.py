@@ -13,10 +13,10 @@ if TYPE_CHECKING:
 
     from cachesim.config import Gpu
     from experiments.reproduce.parts import Parts
-    from kernels.device import Device
     from kernels.frame import Float
     from kernels.gbuffer import GBuffer
     from kernels.method import Method
+    from kernels.opencl.device import Device
 
 GPU = "quadro-p4000"
 SCENES = ("close", "ear", "front")

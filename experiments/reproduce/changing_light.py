@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     from cachesim.config import Gpu
     from experiments.reproduce.experiment import Settings
     from experiments.reproduce.parts import Arrays
-    from kernels.device import Device
     from kernels.method import Method
+    from kernels.opencl.device import Device
 
     #: The G-buffer of each frame.
     Lit = Callable[[int], Any]

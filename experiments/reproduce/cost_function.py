@@ -28,9 +28,9 @@ if TYPE_CHECKING:
     from cachesim.config import Gpu
     from cachesim.cost.fit import Observation
     from cachesim.cost.model import CostModel, Prediction
-    from kernels.device import Device
     from kernels.gbuffer import GBuffer
     from kernels.method import Method
+    from kernels.opencl.device import Device
 
 GPUS = (
     "quadro-p4000", "titan-x-pascal-gpgpusim", "rtx-2060", "rx-5700-xt", "rx-6900-xt", "h100-sxm",

@@ -16,10 +16,10 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from experiments.reproduce.parts import Arrays
-    from kernels.device import Device
     from kernels.frame import Scene
     from kernels.gbuffer import GBuffer
     from kernels.method import Method
+    from kernels.opencl.device import Device
 
 SIZE, QUICK_SIZE = (1280, 720), (160, 90)
 FRAMES, QUICK_FRAMES = 96, 40
@@ -108,7 +108,7 @@ def border_column(width: int, epsilon: float = EPSILON) -> float:
     """
     from scipy.optimize import brentq
 
-    from kernels.profile import SKIN, cdf
+    from kernels.maths.profile import SKIN, cdf
 
     def excess(x: float) -> float:
         scale = NEAR + (FAR - NEAR) * x / width
@@ -119,8 +119,8 @@ def border_column(width: int, epsilon: float = EPSILON) -> float:
 
 def make_scene(size: tuple[int, int], jittered: bool) -> tuple[Scene, int]:
     """The wall, and the length of the jitter's period; each of its views is made once."""
-    from kernels.analytic import wall
-    from kernels.jitter import Jitter
+    from kernels.scenes.analytic import wall
+    from kernels.scenes.jitter import Jitter
 
     def view(x: float, y: float) -> GBuffer:
         return wall(*size, near_pixels_per_mm=NEAR, far_pixels_per_mm=FAR, offset=(x, y))

@@ -22,8 +22,8 @@ if TYPE_CHECKING:
 
     from experiments.reproduce.film import Float
     from experiments.reproduce.parts import Arrays
-    from kernels.device import Device
     from kernels.method import Method
+    from kernels.opencl.device import Device
 
 SIZE, QUICK_SIZE = (960, 540), (128, 72)
 AGES, QUICK_AGES = 48, 32

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from kernels.analytic import Circle, circle
+from kernels.scenes.analytic import Circle, circle
 
 if TYPE_CHECKING:
     from experiments.reproduce.film import Float

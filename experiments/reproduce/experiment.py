@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from experiments.tables import Table
-    from kernels.device import Device
+    from kernels.opencl.device import Device
 
     #: A picture: (h, w) grey or (h, w, 3) colour, uint8.
     Image = npt.NDArray[np.uint8]
@@ -61,7 +61,7 @@ class Settings:
 
 @cache
 def _open_device(name: str | None) -> Device:
-    from kernels.device import open_device
+    from kernels.opencl.device import open_device
 
     return open_device(name)
 

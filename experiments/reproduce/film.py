@@ -13,20 +13,20 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from kernels import taa
 from kernels.frame import advance, check_num_frames, gbuffer_of, render, start_pipeline
-from kernels.history import names_of
-from kernels.update import find_luminance
+from kernels.passes import taa
+from kernels.passes.history import names_of
+from kernels.passes.update import find_luminance
 
 if TYPE_CHECKING:
     import pandas as pd
 
-    from kernels.device import Device
     from kernels.frame import Frame, Scene
     from kernels.gbuffer import GBuffer
     from kernels.method import Method
-    from kernels.motion import MovingScene
+    from kernels.opencl.device import Device
     from kernels.pipeline import Pipeline
+    from kernels.scenes.motion import MovingScene
 
 Float = npt.NDArray[np.float32]
 Mask = npt.NDArray[np.bool_]
@@ -65,7 +65,7 @@ class Shot:
 
     @property
     def moments(self) -> Float:
-        """(h, w, 4) float32: of the online control variate, see `kernels.covariance`."""
+        """(h, w, 4) float32: of the online control variate, see `kernels.passes.covariance`."""
         return self.pipeline.read(names_of("covariance", self.index)[1])
 
     @property
@@ -93,11 +93,11 @@ def jittered_head(name: str, size: tuple[int, int], device: Device) -> tuple[Mov
 
     name: of the camera. size: (width, height).
     """
-    from kernels.camera import camera_named
-    from kernels.head import render_head
-    from kernels.jitter import Jitter
-    from kernels.motion import MovingScene
-    from kernels.paths import still
+    from kernels.scenes.camera import camera_named
+    from kernels.scenes.head import render_head
+    from kernels.scenes.jitter import Jitter
+    from kernels.scenes.motion import MovingScene
+    from kernels.scenes.paths import still
 
     jitter = Jitter("gaussian")
     scene = MovingScene(

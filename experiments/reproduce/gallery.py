@@ -20,10 +20,10 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from experiments.reproduce.parts import Arrays, Parts
-    from kernels.device import Device
     from kernels.frame import Float
     from kernels.gbuffer import GBuffer
     from kernels.method import Method
+    from kernels.opencl.device import Device
 
 NAME = "gallery"
 SCENES = ("close", "ear", "front")

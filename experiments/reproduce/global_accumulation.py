@@ -18,10 +18,10 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from experiments.reproduce.parts import Arrays
-    from kernels.device import Device
     from kernels.gbuffer import GBuffer
     from kernels.method import Method
-    from kernels.motion import MovingScene
+    from kernels.opencl.device import Device
+    from kernels.scenes.motion import MovingScene
 
 SCENE = "close"
 SIZE, QUICK_SIZE = (1280, 720), (128, 72)

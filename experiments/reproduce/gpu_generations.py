@@ -12,9 +12,9 @@ if TYPE_CHECKING:
     import pandas as pd
 
     from cachesim.config import Gpu
-    from kernels.device import Device
     from kernels.gbuffer import GBuffer
     from kernels.method import Method
+    from kernels.opencl.device import Device
 
 GPUS = {
     "titan-x-pascal": "Pascal",

@@ -23,10 +23,10 @@ from experiments.reproduce.ground_truth_verdicts import EXACT, PUBLISHED, SEPARA
 if TYPE_CHECKING:
     from experiments.reproduce.ground_truth_volume import Compared
     from experiments.reproduce.parts import Arrays, Parts
-    from kernels.device import Device
     from kernels.gbuffer import GBuffer
-    from kernels.mesh import Mesh
     from kernels.method import Method
+    from kernels.opencl.device import Device
+    from kernels.scenes.mesh import Mesh
 
 #: Paths of meshes, a dragon or a scanned head, separated as in PATH.
 MESHES_VARIABLE = "CACHESIM_MESHES"
@@ -139,7 +139,7 @@ def load_meshes() -> list[Mesh]:
     Raises:
         InputError: one of them cannot be read.
     """
-    from kernels.mesh import load_mesh
+    from kernels.scenes.mesh import load_mesh
 
     paths = [p for p in os.environ.get(MESHES_VARIABLE, "").split(os.pathsep) if p]
     return [load_mesh(Path(p)) for p in paths]
@@ -147,10 +147,10 @@ def load_meshes() -> list[Mesh]:
 
 def load_scenes(quick: bool, meshes: list[Mesh], device: Device) -> dict[str, GBuffer]:
     """The slab, the ball, the head and the meshes."""
-    from kernels.analytic import wall
-    from kernels.mesh_render import render_mesh
     from kernels.scene import load_scene
-    from kernels.sphere import sphere
+    from kernels.scenes.analytic import wall
+    from kernels.scenes.mesh_render import render_mesh
+    from kernels.scenes.sphere import sphere
 
     size = QUICK_SIZE if quick else SIZE
     scale = QUICK_SLAB_PIXELS_PER_MM if quick else SLAB_PIXELS_PER_MM
@@ -216,9 +216,9 @@ def draw_counts(settings: Settings, meshes: list[Mesh], device: Device) -> dict[
     from experiments.p4000_study import digest
     from experiments.plots import count_map
     from kernels.frame import render
-    from kernels.mesh_render import render_mesh
     from kernels.method import Method
     from kernels.scene import load_scene
+    from kernels.scenes.mesh_render import render_mesh
 
     size = QUICK_COUNT_SIZE if settings.quick else COUNT_SIZE
     num_frames = QUICK_COUNT_FRAMES if settings.quick else COUNT_FRAMES

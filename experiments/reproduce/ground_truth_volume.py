@@ -23,18 +23,18 @@ import numpy.typing as npt
 
 from experiments.reproduce import path_tracing
 from experiments.reproduce.path_tracing import Medium
-from kernels.analytic import wall
-from kernels.camera import Camera
 from kernels.dense import scatter_densely
+from kernels.maths.profile import Profile, shape_dmfp, shape_searchlight
 from kernels.method import Method
-from kernels.profile import Profile, shape_dmfp, shape_searchlight
-from kernels.sphere import SIDEWAYS, sphere
+from kernels.scenes.analytic import wall
+from kernels.scenes.camera import Camera
+from kernels.scenes.sphere import SIDEWAYS, sphere
 
 if TYPE_CHECKING:
     from experiments.reproduce.parts import Arrays, Parts
-    from kernels.device import Device
     from kernels.gbuffer import GBuffer
-    from kernels.mesh import Mesh
+    from kernels.opencl.device import Device
+    from kernels.scenes.mesh import Mesh
 
 Float = npt.NDArray[np.float64]
 
@@ -213,8 +213,8 @@ def _compare_mesh(
     device: Device,
 ) -> Compared:
     """A mesh from the front under one small light; its maps are left out."""
-    from kernels.light import Light, Rig
-    from kernels.mesh_render import mesh_camera, render_mesh
+    from kernels.scenes.light import Light, Rig
+    from kernels.scenes.mesh_render import mesh_camera, render_mesh
 
     bare = replace(mesh, albedo_map=None, normal_map=None)
     camera = mesh_camera("front", bare)

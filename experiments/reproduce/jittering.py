@@ -15,9 +15,9 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from experiments.reproduce.parts import Arrays
-    from kernels.device import Device
     from kernels.frame import Scene
     from kernels.method import Method
+    from kernels.opencl.device import Device
 
 SCENE = "front"
 SIZE, QUICK_SIZE = (1280, 720), (192, 108)
@@ -106,7 +106,7 @@ def measure_control(
     coefficient (h, w), NaN where nothing scatters or none is estimated.
     """
     from experiments.reproduce.film import Spread, play
-    from kernels.covariance import find_coefficient
+    from kernels.passes.covariance import find_coefficient
     from kernels.quality import psnr
 
     exact = [references[str(point)].astype(np.float32) for point in range(len(references))]

@@ -13,7 +13,7 @@ from experiments.reproduce.changing_light import CONSTANT, NO_CV, ONLINE, Film, 
 from experiments.reproduce.experiment import Comparison, Experiment, Outcome, Settings
 
 if TYPE_CHECKING:
-    from kernels.device import Device
+    from kernels.opencl.device import Device
 
 SIZE, QUICK_SIZE = (2560, 1440), (192, 108)
 FRAMES, QUICK_FRAMES = 72, 27
@@ -26,7 +26,7 @@ PRINTED_MS = (12.9, 5.2)
 
 def make_film(quick: bool) -> Film:
     """Off after a third of the frames, on after two."""
-    from kernels.paths import flash
+    from kernels.scenes.paths import flash
 
     size, frames = (QUICK_SIZE, QUICK_FRAMES) if quick else (SIZE, FRAMES)
     off, on = frames // 3, 2 * frames // 3
@@ -48,11 +48,11 @@ def make_film(quick: bool) -> Film:
 
 def make_scene(size: tuple[int, int], off: int, on: int, device: Device) -> Any:
     """The head whose key light goes off and on; fill, rim and ambient light stay."""
-    from kernels.camera import CAMERAS
-    from kernels.head import render_head
-    from kernels.light import RIG
-    from kernels.motion import MovingScene
-    from kernels.paths import flash, still, switched
+    from kernels.scenes.camera import CAMERAS
+    from kernels.scenes.head import render_head
+    from kernels.scenes.light import RIG
+    from kernels.scenes.motion import MovingScene
+    from kernels.scenes.paths import flash, still, switched
 
     return MovingScene(
         lambda camera, rig: render_head(camera, *size, device, rig),

@@ -18,11 +18,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from kernels.camera import Camera, Vector
+from kernels.scenes.camera import Camera, Vector
 from traces.errors import WorkError
 
 if TYPE_CHECKING:
-    from kernels.mesh import Mesh
+    from kernels.scenes.mesh import Mesh
 
 Float = npt.NDArray[np.float32]
 PACKAGE, VARIANT = "mitsuba", "scalar_rgb"

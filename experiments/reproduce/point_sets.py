@@ -10,7 +10,7 @@ from math import sqrt
 import numpy as np
 import numpy.typing as npt
 
-from kernels.sequence import pcg3d16, r2
+from kernels.maths.sequence import pcg3d16, r2
 
 Values = npt.NDArray[np.float64]
 #: Both coordinates, each (num_starts, count).

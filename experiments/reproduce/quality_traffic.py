@@ -19,10 +19,10 @@ if TYPE_CHECKING:
 
     from cachesim.config import Gpu
     from experiments.reproduce.parts import Parts
-    from kernels.device import Device
     from kernels.frame import Float
     from kernels.gbuffer import GBuffer
     from kernels.method import Method
+    from kernels.opencl.device import Device
 
 SCENES, QUICK_SCENES = ("close", "ear", "front"), ("front",)
 SIZE, QUICK_SIZE = (1920, 1080), (160, 90)

@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from experiments.reproduce.parts import Arrays, Parts
-    from kernels.device import Device
     from kernels.frame import Float
     from kernels.gbuffer import GBuffer
     from kernels.method import Method
+    from kernels.opencl.device import Device
 
 
 def draw_reference(

@@ -13,7 +13,7 @@ from experiments.reproduce.changing_light import CONSTANT, NO_CV, ONLINE, Film, 
 from experiments.reproduce.experiment import Comparison, Experiment, Outcome, Settings
 
 if TYPE_CHECKING:
-    from kernels.device import Device
+    from kernels.opencl.device import Device
 
 SIZE, QUICK_SIZE = (2560, 1440), (192, 108)
 FRAMES, QUICK_FRAMES = 72, 32
@@ -40,11 +40,11 @@ def make_film(quick: bool) -> Film:
 
 def make_scene(size: tuple[int, int], device: Device) -> Any:
     """The head whose key light circles around the vertical axis."""
-    from kernels.camera import CAMERAS
-    from kernels.head import render_head
-    from kernels.light import RIG
-    from kernels.motion import MovingScene
-    from kernels.paths import still, swing
+    from kernels.scenes.camera import CAMERAS
+    from kernels.scenes.head import render_head
+    from kernels.scenes.light import RIG
+    from kernels.scenes.motion import MovingScene
+    from kernels.scenes.paths import still, swing
 
     return MovingScene(
         lambda camera, rig: render_head(camera, *size, device, rig),

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from experiments.reproduce.experiment import Comparison, Experiment, Outcome, Settings, compare
-from kernels import profile
+from kernels.maths import profile
 
 if TYPE_CHECKING:
     import pandas as pd

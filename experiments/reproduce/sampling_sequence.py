@@ -16,8 +16,8 @@ import numpy as np
 
 from experiments.reproduce.experiment import Comparison, Experiment, Outcome, Settings, compare
 from experiments.reproduce.point_sets import PROGRESSIVE, SEQUENCES, Points, Values, l2_star_squared
-from kernels import profile
-from kernels.sequence import r2
+from kernels.maths import profile
+from kernels.maths.sequence import r2
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -20,10 +20,10 @@ if TYPE_CHECKING:
     from cachesim import Report
     from cachesim.config import Gpu
     from experiments.reproduce.demand_maps import DemandMaps
-    from kernels.device import Device
     from kernels.frame import Float
     from kernels.gbuffer import GBuffer
     from kernels.method import Method
+    from kernels.opencl.device import Device
 
 GPU, SCENE = "quadro-p4000", "front"
 SIZE, QUICK_SIZE = (1920, 1080), (160, 90)

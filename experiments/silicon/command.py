@@ -100,7 +100,7 @@ def _prepare(folder: Path, names: list[str], device_name: str | None, effort: in
     from experiments.silicon.cases import PICTURES
     from experiments.silicon.inputs import write_picture
     from experiments.silicon.prepare import prepare as render
-    from kernels.device import open_device
+    from kernels.opencl.device import open_device
     from traces.errors import unknown
 
     known = {

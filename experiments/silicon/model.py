@@ -20,7 +20,7 @@ from traces.trace import Chunk, Trace
 if TYPE_CHECKING:
     from cachesim.config import Gpu
     from cachesim.report import Report
-    from kernels.device import Device
+    from kernels.opencl.device import Device
 
 #: How each way to fetch enters the model: (fetch path, layout; None takes the GPU's own).
 PATHS: dict[str, tuple[str, str | None]] = {

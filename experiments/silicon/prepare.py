@@ -13,12 +13,12 @@ import numpy.typing as npt
 from experiments.silicon.cases import HISTORY_FRAMES, NUM_SAMPLES
 from experiments.silicon.inputs import Expected, Picture
 from kernels import resources
-from kernels.device import Device, open_device
 from kernels.frame import advance
 from kernels.method import Method
+from kernels.opencl.device import Device, open_device
+from kernels.passes.update import history_names
 from kernels.pipeline import Pipeline
 from kernels.scene import load_scene
-from kernels.update import history_names
 
 
 def method_of(counts: str) -> Method:

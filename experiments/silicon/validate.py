@@ -61,7 +61,7 @@ def run_comparison(
         InputError: a damaged file, an unknown picture or GPU. DeviceError: no OpenCL device.
     """
     from cachesim import presets
-    from kernels.device import open_device
+    from kernels.opencl.device import open_device
 
     measured = compare.read_measured(path)
     chosen = choose_cases(measured, pictures)

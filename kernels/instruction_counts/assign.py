@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
-from kernels import classify
 from kernels.access import Access
 from kernels.instruction_counts.data import Counts, counts_of
 from kernels.instruction_counts.segments import Segment, join
 from kernels.method import Method
+from kernels.passes import classify
 from traces.trace import WAIT
 
 

@@ -14,7 +14,7 @@ import sys
 from dataclasses import replace
 from typing import Any
 
-from kernels import estimate, program
+from kernels import program
 from kernels.access import Access
 from kernels.instruction_counts.compile import TOOLCHAIN, Toolchain
 from kernels.instruction_counts.data import TARGETS, data_file, split_target
@@ -22,8 +22,9 @@ from kernels.instruction_counts.flow import Flow, Way
 from kernels.instruction_counts.machine import CountError, MachineCode
 from kernels.instruction_counts.segments import Segment, Walk, to_text
 from kernels.instruction_counts.variants import KERNELS, all_variants, macros_of
+from kernels.launches import PASSES
 from kernels.method import PLANES, Method
-from kernels.passes import PASSES
+from kernels.passes import estimate
 
 #: The kernel's name of a texture where it differs, by kernel and texture; "" = every kernel's.
 _ARGUMENT = {

@@ -1,5 +1,5 @@
-// The float32 functions of kernels/polynomial.cl and the parts of the passes that kernels/sampling.cl
-// and kernels/common.cl spell out, for one lane and in the same order of operations: built without
+// The float32 functions of kernels/maths/polynomial.cl and the parts of the passes that kernels/passes/sampling.cl
+// and kernels/passes/common.cl spell out, for one lane and in the same order of operations: built without
 // contraction (-fmad=false), they give the same bits.
 #pragma once
 #include "portable.h"

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from kernels.method import Method
-from kernels.update import find_luminance
+from kernels.passes.update import find_luminance
 
 _F = np.float32
 _ONE = _F(1)

@@ -22,8 +22,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from kernels.maths.profile import Profile, cdf, pdf
 from kernels.method import Method
-from kernels.profile import Profile, cdf, pdf
 
 #: (weight, variance in mm^2) of the skin profile's Gaussians but for the narrowest.
 SKIN_GAUSSIANS = ((0.1, 0.0484), (0.118, 0.187), (0.113, 0.567), (0.358, 1.99), (0.078, 7.41))

@@ -24,15 +24,15 @@ import numpy.typing as npt
 from kernels import resources
 from kernels.access import Access
 from kernels.grid import WARPS_PER_CTA, Grid
-from kernels.history import history_names, reproject
 from kernels.method import Method
-from kernels.setup import texels
+from kernels.passes.history import history_names, reproject
+from kernels.passes.setup import texels
 from kernels.tiles import EMPTY, PASSTHROUGH, SAMPLED, SEPARABLE, count_tiles
 from traces.texture import INACTIVE_TEXEL, WARP_SIZE, pack_texel
 
 if TYPE_CHECKING:
+    from kernels.passes.sampling import Constants
     from kernels.pipeline import Pipeline
-    from kernels.sampling import Constants
 
 _F = np.float32
 #: Mean radius of Burley's profile over its scale d. Facts sheet 2.1.

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from kernels.camera import Camera
+from kernels.scenes.camera import Camera
 
 #: What lay behind the previous camera gets this velocity, texels: off every screen.
 BEHIND = -32768.0

@@ -13,7 +13,9 @@ import numpy.typing as npt
 
 from kernels.access import Access
 from kernels.grid import Grid
-from kernels.history import (
+from kernels.maths.polynomial import burley
+from kernels.method import Method
+from kernels.passes.history import (
     history_names,
     is_known,
     names_of,
@@ -22,8 +24,6 @@ from kernels.history import (
     read_past_counts,
     reproject,
 )
-from kernels.method import Method
-from kernels.polynomial import burley
 
 if TYPE_CHECKING:
     from kernels.pipeline import Pipeline

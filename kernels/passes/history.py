@@ -2,7 +2,7 @@
 
 A texel holds mean count, depth, variance of the mean, and mean of the tracked scalar. The sliding
 rule keeps the counts of the last frames beside it, a byte each, and the online control variate the
-means and covariance of lighting and result (`kernels.covariance`).
+means and covariance of lighting and result (`kernels.passes.covariance`).
 """
 
 from __future__ import annotations

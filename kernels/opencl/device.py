@@ -19,8 +19,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from kernels.driver_noise import noise_kept, short_reason
-from kernels.icd import use_all_drivers
+from kernels.opencl.driver_noise import noise_kept, short_reason
+from kernels.opencl.icd import use_all_drivers
 from traces.errors import WorkError, unknown
 
 if TYPE_CHECKING:

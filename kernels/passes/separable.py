@@ -20,13 +20,13 @@ from kernels import resources
 from kernels.access import Access, States
 from kernels.grid import Grid
 from kernels.method import Method
-from kernels.separable_taps import make_taps
-from kernels.setup import texels
+from kernels.passes.separable_taps import make_taps
+from kernels.passes.setup import texels
 from traces.texture import INACTIVE_TEXEL, pack_texel
 
 if TYPE_CHECKING:
+    from kernels.passes.sampling import Constants
     from kernels.pipeline import Pipeline
-    from kernels.sampling import Constants
 
 _F = np.float32
 _ONE = _F(1)

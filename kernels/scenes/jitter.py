@@ -14,7 +14,7 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-from kernels.polynomial import poly_cos_sin, poly_exp, poly_log
+from kernels.maths.polynomial import poly_cos_sin, poly_exp, poly_log
 from traces.errors import InputError, unknown
 
 FILTERS = ("box", "gaussian")

@@ -12,8 +12,8 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from kernels.camera import PORTRAIT, check_size
 from kernels.gbuffer import GBuffer
+from kernels.scenes.camera import PORTRAIT, check_size
 from traces.errors import InputError
 
 Float = npt.NDArray[np.float32]

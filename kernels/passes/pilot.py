@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from kernels import estimate, sampling
 from kernels.access import Access, States
 from kernels.grid import Grid
 from kernels.method import Method
+from kernels.passes import estimate, sampling
 
 if TYPE_CHECKING:
     from kernels.pipeline import Pipeline

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from kernels.camera import PORTRAIT, Vector, check_size
 from kernels.gbuffer import GBuffer
+from kernels.scenes.camera import PORTRAIT, Vector, check_size
 from traces.errors import InputError
 
 ALBEDO = (0.78, 0.57, 0.45)

@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from kernels.camera import Camera, Vector, camera_named, check_size
 from kernels.gbuffer import GBuffer
-from kernels.light import RIG, Light, Rig
-from kernels.mesh import HEAD_CM, Mesh, load_mesh
+from kernels.scenes.camera import Camera, Vector, camera_named, check_size
+from kernels.scenes.light import RIG, Light, Rig
+from kernels.scenes.mesh import HEAD_CM, Mesh, load_mesh
 from traces.errors import InputError
 
 Float = npt.NDArray[np.float32]

@@ -12,9 +12,9 @@ from dataclasses import replace
 import numpy as np
 import numpy.typing as npt
 
-from kernels.camera import Camera, Vector
-from kernels.light import Rig
-from kernels.polynomial import poly_cos_sin
+from kernels.maths.polynomial import poly_cos_sin
+from kernels.scenes.camera import Camera, Vector
+from kernels.scenes.light import Rig
 from traces.errors import InputError, unknown
 
 CameraPath = Callable[[int], Camera]

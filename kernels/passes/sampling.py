@@ -5,9 +5,9 @@ Facts sheet 2.3 to 2.7. The twin of sampling.cl, operation by operation. Left ou
 estimator: its division by 0.99995, boundary colour bleed (there is one profile) and the opacity
 fade.
 
-Estimators without history need the variance between a pixel's own samples, see `kernels.spread`:
-the last-frame estimator's sampling pass writes it to the history texture. The pilot pass is the
-same kernel with few samples, which writes nothing else.
+Estimators without history need the variance between a pixel's own samples, see
+`kernels.passes.spread`: the last-frame estimator's sampling pass writes it to the history texture.
+The pilot pass is the same kernel with few samples, which writes nothing else.
 """
 
 from __future__ import annotations
@@ -18,17 +18,18 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from kernels import estimate, resources
+from kernels import resources
 from kernels.access import Access
 from kernels.grid import Grid
-from kernels.history import history_names, reproject
+from kernels.maths.polynomial import burley, poly_cbrt, poly_cos_sin, poly_log
+from kernels.maths.profile import APPROXIMATE_C
+from kernels.maths.sequence import pcg3d16, r2
 from kernels.method import Method
-from kernels.patch import PATCH_PARTS, is_held, patch_accesses, patch_texels
-from kernels.polynomial import burley, poly_cbrt, poly_cos_sin, poly_log
-from kernels.profile import APPROXIMATE_C
-from kernels.sequence import pcg3d16, r2
-from kernels.setup import texels
-from kernels.spread import find_spread, weigh
+from kernels.passes import estimate
+from kernels.passes.history import history_names, reproject
+from kernels.passes.patch import PATCH_PARTS, is_held, patch_accesses, patch_texels
+from kernels.passes.setup import texels
+from kernels.passes.spread import find_spread, weigh
 from traces.texture import INACTIVE_TEXEL, pack_texel
 
 if TYPE_CHECKING:

@@ -21,8 +21,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from kernels.camera import MAX_SIZE
 from kernels.gbuffer import GBuffer
+from kernels.scenes.camera import MAX_SIZE
 from traces.errors import InputError
 from traces.files import replacing, writing
 

@@ -19,7 +19,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from kernels.device import (
+from kernels.opencl.device import (
     DEVICE_VARIABLE,
     DeviceError,
     Probe,
@@ -27,8 +27,8 @@ from kernels.device import (
     is_named,
     probe_device,
 )
-from kernels.driver_noise import short_reason
-from kernels.icd import driver_libraries, user_vendors
+from kernels.opencl.driver_noise import short_reason
+from kernels.opencl.icd import driver_libraries, user_vendors
 
 #: A CPU device for any x86-64 Linux; the `intel` extra of this project.
 INTEL_WHEELS = ("intel-opencl-rt", "intel-cmplr-lib-rt")
@@ -153,7 +153,7 @@ def _in_fresh_process(*arguments: str) -> dict[str, Any]:
     environment["PYTHONPATH"] = os.pathsep.join(
         [str(_ROOT), *filter(None, [environment.get("PYTHONPATH")])]
     )
-    command = [sys.executable, "-m", "kernels.doctor", *arguments]
+    command = [sys.executable, "-m", "kernels.opencl.doctor", *arguments]
     try:
         done = subprocess.run(
             command,

@@ -15,7 +15,7 @@ from kernels import resources
 from kernels.access import Access
 from kernels.grid import Grid
 from kernels.method import Method
-from kernels.setup import texels
+from kernels.passes.setup import texels
 
 if TYPE_CHECKING:
     from kernels.pipeline import Pipeline

@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from kernels.camera import Camera, check_size
-from kernels.device import Device, open_device
 from kernels.gbuffer import GBuffer
-from kernels.light import RIG, Rig
+from kernels.opencl.device import Device, open_device
+from kernels.scenes.camera import Camera, check_size
+from kernels.scenes.light import RIG, Rig
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -38,7 +38,7 @@ _PLANES = {"irradiance": 3, "albedo": 3, "non_subsurface": 3, "depth_cm": 1, "no
 def source() -> str:
     """The OpenCL source of the head, all files in order."""
     return "\n".join(
-        resources.files("kernels").joinpath(name).read_text("utf-8") for name in SOURCE_FILES
+        resources.files("kernels.scenes").joinpath(name).read_text("utf-8") for name in SOURCE_FILES
     )
 
 

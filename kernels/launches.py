@@ -5,7 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Protocol
 
-from kernels import (
+from kernels.access import Access, Program
+from kernels.grid import Grid
+from kernels.instruction_counts.assign import count_pass
+from kernels.instruction_counts.data import DEFAULT_TARGET
+from kernels.instruction_counts.segments import join
+from kernels.method import PLANES, Method
+from kernels.passes import (
     classify,
     combine,
     overlay,
@@ -17,12 +23,6 @@ from kernels import (
     taa,
     update,
 )
-from kernels.access import Access, Program
-from kernels.grid import Grid
-from kernels.instruction_counts.assign import count_pass
-from kernels.instruction_counts.data import DEFAULT_TARGET
-from kernels.instruction_counts.segments import join
-from kernels.method import PLANES, Method
 from kernels.tiles import CLASS_OF_PASS
 from traces.trace import WAIT
 

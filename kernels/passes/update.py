@@ -16,11 +16,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from kernels import covariance, resources
+from kernels import resources
 from kernels.access import Access
-from kernels.estimate import distant_share
 from kernels.grid import Grid
-from kernels.history import (
+from kernels.maths.polynomial import poly_gamma
+from kernels.method import MAX_PAST_FRAMES, Method
+from kernels.passes import covariance
+from kernels.passes.estimate import distant_share
+from kernels.passes.history import (
     has_history,
     history_names,
     is_known,
@@ -32,9 +35,7 @@ from kernels.history import (
     read_past_counts,
     reproject,
 )
-from kernels.method import MAX_PAST_FRAMES, Method
-from kernels.polynomial import poly_gamma
-from kernels.setup import texels
+from kernels.passes.setup import texels
 from traces.texture import INACTIVE_TEXEL, pack_texel
 
 if TYPE_CHECKING:

@@ -15,13 +15,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from kernels.camera import Camera
 from kernels.frame import Scene, gbuffer_of
 from kernels.gbuffer import GBuffer
-from kernels.jitter import Jitter
-from kernels.light import RIG, Rig
-from kernels.paths import CameraPath, Intensity, RigPath, check_finite
-from kernels.velocity import camera_velocity
+from kernels.scenes.camera import Camera
+from kernels.scenes.jitter import Jitter
+from kernels.scenes.light import RIG, Rig
+from kernels.scenes.paths import CameraPath, Intensity, RigPath, check_finite
+from kernels.scenes.velocity import camera_velocity
 from traces.errors import InputError
 
 
@@ -31,7 +31,7 @@ class MovingScene:
 
     render: the view of one camera under one rig, such as
         `lambda camera, rig: render_head(camera, width, height, rig=rig)`.
-    camera, rig: by frame number, see `kernels.paths`. jitter: None = every ray goes
+    camera, rig: by frame number, see `kernels.scenes.paths`. jitter: None = every ray goes
         through its pixel's centre.
     num_kept: views that are kept, so that what comes again (a still view, a light that flashes, the
         next period of the jitter) is not rendered again; at least 2.

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 import trimesh
 
-from kernels.image_map import ImageMap, load_albedo, load_normals
+from kernels.scenes.image_map import ImageMap, load_albedo, load_normals
 from traces.errors import InputError, unknown
 
 Float = npt.NDArray[np.float32]

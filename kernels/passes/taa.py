@@ -22,7 +22,7 @@ from kernels import resources
 from kernels.access import Access, States
 from kernels.grid import OUTSIDE, Grid
 from kernels.method import Method
-from kernels.setup import texels
+from kernels.passes.setup import texels
 from traces.texture import INACTIVE_TEXEL, pack_texel
 
 if TYPE_CHECKING:
