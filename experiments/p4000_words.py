@@ -71,10 +71,14 @@ def _against(ms: float, published: float) -> str:
 
 
 def _bound(part: Cell) -> str:
-    """Which bound, with its share."""
+    """Which bound, with its share, and how busy the schedulers were."""
     reason = part["bound"]
     share = f"{part['bound_share']:.0%} of its cycles"
-    return f"Bound by {REASON_NAMES[reason]} ({share}: {REASONS[reason]})."
+    line = f"Bound by {REASON_NAMES[reason]} ({share}: {REASONS[reason]})"
+    if reason != "issue":
+        running = max(1, part["cycles"] - part["launch_cycles"])
+        line += f"; {part['where']['issue'] / running:.0%} of them issued an instruction"
+    return line + "."
 
 
 def _traffic(part: Cell) -> str:

@@ -109,16 +109,10 @@ def notes(timing: TimingResult, gpu: Gpu) -> tuple[str, ...]:
     total = timing.total
     name = REASON_NAMES[total.bottleneck]
     meaning = f"{name[0].upper()}{name[1:]}: {REASONS[total.bottleneck]}."
-    used = issue_slots_used(total, gpu)
-    if total.bottleneck == "issue" and used is not None:
-        # An SM that issues one instruction in a cycle is not held up, but may have room for more.
-        waits = {r: n for r, n in total.where.items() if r not in ("issue", "launch")}
-        meaning += f" It filled {used:.0%} of the issue slots"
-        if any(waits.values()):
-            wait = max(waits, key=lambda r: waits[r])
-            share = waits[wait] / max(1, total.cycles - total.where.get("launch", 0))
-            meaning += f"; what it waited for most is {REASON_NAMES[wait]}, {share:.0%}"
-        meaning += "."
+    running = total.cycles - total.where.get("launch", 0)
+    if total.bottleneck not in ("issue", "launch") and running:
+        issued = total.where.get("issue", 0) / running
+        meaning += f" Instructions issued in {issued:.0%} of the schedulers' cycles."
     lines = [bottleneck_line(total), meaning]
     for part in timing.passes:
         if part.bottleneck != total.bottleneck:

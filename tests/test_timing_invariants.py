@@ -126,7 +126,13 @@ def test_the_clock_sees_the_counting_models_accesses_and_ends_empty(name: str, d
     for one in clock.launches:
         assert sum(one.where.values()) == one.cycles
         assert min(one.where.values()) >= 0
-        assert sum(one.warp_instructions.values()) >= 0
+        # A slot issues an instruction, or several of one warp; a share is rounded to a cycle.
+        assert gpu.sm_timing is not None
+        schedulers = gpu.sm.count * gpu.sm_timing.num_schedulers
+        num_issued = sum(one.warp_instructions.values())
+        used = one.where["issue"] * schedulers
+        fewest = num_issued / gpu.sm_timing.issue_per_warp
+        assert fewest - schedulers <= used <= num_issued + schedulers
 
 
 def cut(trace: Trace, ctas_per_chunk: int) -> Trace:

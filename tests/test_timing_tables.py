@@ -69,7 +69,8 @@ def test_the_bottleneck_is_one_line_with_its_share_and_the_busiest_level() -> No
     assert line == (
         "Bottleneck: DRAM, 40% of the cycles without launches; busiest DRAM at 75% of peak."
     )
-    assert where_table(timing_result(), GPU).notes == (line, f"DRAM: {REASONS['dram']}.")
+    told = f"DRAM: {REASONS['dram']}. Instructions issued in 15% of the schedulers' cycles."
+    assert where_table(timing_result(), GPU).notes == (line, told)
 
 
 @pytest.mark.parametrize("reason", REASONS)
@@ -87,24 +88,24 @@ def test_a_run_of_launches_alone_is_bound_by_them() -> None:
 
 
 def test_passes_with_another_bottleneck_are_named() -> None:
-    where = dict(one_pass().where) | {"issue": 4000, "dram": 1500}
+    where = {"issue": 4000, "l2": 5000, "dram": 1000, "launch": 1000}
     result = timing_result(one_pass("setup", where=where), one_pass("sampling", scale=4))
     told = where_table(result, GPU).notes
     assert told[0].startswith("Bottleneck: DRAM")
-    assert "In pass setup it is issue, 40%." in told
+    assert "In pass setup it is L2, 50%." in told
     assert not any("sampling" in line for line in told)
 
 
-def test_a_run_that_issues_most_says_how_many_slots_it_filled() -> None:
-    where = dict(one_pass().where) | {"issue": 4000, "dram": 1500}
-    part = one_pass(where=where)
+@pytest.mark.parametrize(("issued", "bound"), [(7900, "dram"), (8100, "issue")])
+def test_issue_is_the_bottleneck_from_four_fifths_of_the_slots_on(issued: int, bound: str) -> None:
+    where = {"issue": issued, "dram": 10_000 - issued, "launch": 1000}
+    assert one_pass(where=where).bottleneck == bound
+
+
+def test_issue_slots_used_counts_every_slot_of_every_scheduler() -> None:
+    part = one_pass()
     # 6000 instructions in 40,000 SM-cycles of four schedulers with two slots each.
     assert issue_slots_used(part, GPU) == pytest.approx(6000 / (40_000 * 4 * 2))
-    told = where_table(timing_result(part), GPU).notes[1]
-    assert told == (
-        "Issue: the SM issued an instruction. It filled 2% of the issue slots; what it waited for "
-        "most is DRAM, 15%."
-    )
 
 
 def test_achieved_bandwidth_is_bytes_over_the_time_without_launches() -> None:

@@ -183,10 +183,12 @@ class Clock:
         """Book the cycles that sleeping SMs have not booked yet."""
         now = self.cycles
         state = self.state
+        schedulers = int(state.pool.machine[0]["num_schedulers"])
         for sm in state.sms:
-            state.reasons[int(sm["last_reason"])] += now - 1 - int(sm["last_step"])
+            slept = now - 1 - int(sm["last_step"])
+            np.add.at(state.reasons, sm["stall"][:schedulers], slept)
             sm["last_step"] = now - 1
-            sm["last_reason"] = records.R_IDLE
+            sm["stall"] = records.R_IDLE
 
     def _run(self) -> None:
         while True:

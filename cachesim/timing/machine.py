@@ -402,7 +402,7 @@ def build(gpu: Gpu, fetch_path: str, num_groups: int) -> State:
     machine[0]["free_top"] = pool_size
     sms = records.zeros(num_sms, records.SM)
     sms["wake"] = NEVER
-    sms["last_reason"] = records.R_IDLE
+    sms["stall"] = records.R_IDLE
     sms["last_step"] = -1
     sms["last_issued"] = -1
     sms["issued_slot"] = -1

@@ -71,8 +71,8 @@ def _shares(total: int, weights: dict[str, int]) -> dict[str, int]:
     return parts
 
 
-def _where(before: Snapshot, after: Snapshot, num_sms: int, launch: int) -> dict[str, int]:
-    """Reason -> cycles of one launch."""
+def _where(before: Snapshot, after: Snapshot, num_slots: int, launch: int) -> dict[str, int]:
+    """Reason -> cycles of one launch. num_slots: schedulers of all SMs."""
     spent = after.reasons - before.reasons
     waits = after.waits - before.waits
     least = np.where(after.waits[:, 2] < NEVER, after.waits[:, 2], 0)
@@ -85,12 +85,12 @@ def _where(before: Snapshot, after: Snapshot, num_sms: int, launch: int) -> dict
     }
     memory["latency"] = max(0, latency - sum(memory.values()))
     shared = _shares(int(spent[R_MEMORY]), memory)
-    sm_cycles = {name: int(spent[code]) for name, code in _DIRECT.items()}
+    slots = {name: int(spent[code]) for name, code in _DIRECT.items()}
     for name, share in shared.items():
-        sm_cycles[name] = sm_cycles.get(name, 0) + share
+        slots[name] = slots.get(name, 0) + share
     # While the kernel is launched every SM is idle.
-    sm_cycles["idle"] = max(0, sm_cycles["idle"] - launch * num_sms)
-    cycles = _shares(after.now - before.now - launch, sm_cycles)
+    slots["idle"] = max(0, slots["idle"] - launch * num_slots)
+    cycles = _shares(after.now - before.now - launch, slots)
     cycles["launch"] = launch
     return {name: cycles.get(name, 0) for name in REASONS}
 
@@ -147,7 +147,7 @@ def passes_of(name: str, before: Snapshot, after: Snapshot, gpu: Gpu, state: Sta
         1,
         after.now - before.now,
         launch,
-        _where(before, after, gpu.sm.count, launch),
+        _where(before, after, gpu.sm.count * gpu.sm_timing.num_schedulers, launch),
         {kind: int(issued[k]) for k, kind in enumerate(KINDS[:5])},
         after.resident - before.resident,
         gpu.sm.count * (after.now - before.now - launch),

@@ -46,8 +46,8 @@ OUTCOMES = ("HIT", "HIT_RESERVED", "MISS", "SECTOR_MISS", "RESERVATION_FAIL", "M
 # Why a look-up fails: no place in the miss queue, no MSHR, anything else.
 NO_QUEUE, NO_MSHR, NO_OTHER = range(3)
 
-# Reasons for a cycle of an SM, in the order of `results.REASONS`; MEMORY_WAIT is shared out over
-# interconnect, l2, dram and latency at the end.
+# Reasons for an issue slot (a scheduler's cycle), in the order of `results.REASONS`; MEMORY_WAIT is
+# shared out over interconnect, l2, dram and latency at the end.
 R_ISSUE, R_ARITHMETIC, R_L1_BANDWIDTH, R_L1_RESERVATION, R_INTERCONNECT, R_IDLE, R_MEMORY = range(7)
 NUM_REASONS = 7
 
@@ -195,7 +195,6 @@ SM = _in_lines(
     # Until then, and until something new comes or room is made, stepping the collectors changes
     # nothing.
     ("collect_from", "i8"),
-    ("last_reason", "i4"),
     ("eject_head", "i4"),
     ("eject_count", "i4"),
     ("waits_for_room", "i4"),  # whether it sleeps until its port has room
@@ -206,6 +205,9 @@ SM = _in_lines(
     ("num_collecting", "i4"),
     ("free_places", "i4"),
     ("ready", "u8", (5,)),
+    ("resident", "u8"),  # slots with a warp, and of those the ones that wait for loads or stores
+    ("blocked", "u8"),
+    ("stall", "i1", (MAX_SCHEDULERS,)),  # why each scheduler that did not issue did not
     ("queue_count", "i1", (MAX_SCHEDULERS,)),
     ("queue_head", "i1", (MAX_SCHEDULERS,)),
     # GPGPU-Sim's operand collectors: issued[kind, scheduler], then collector[unit, scheduler].

@@ -11,9 +11,9 @@ from typing import Any
 
 import pandas as pd
 
-#: Where a cycle of an SM can go, and what it says when most of them go there.
+#: Where an issue slot, the cycle of a scheduler, can go, and what it says when most go there.
 REASONS: dict[str, str] = {
-    "issue": "the SM issued an instruction",
+    "issue": "the schedulers issued instructions",
     "arithmetic": "every warp waited for an execution unit or its result",
     "l1_bandwidth": "memory instructions waited for the L1's ports, tags, banks or filters",
     "l1_reservation": "a miss found no MSHR, merge slot, line or queue entry and was tried again",
@@ -24,6 +24,10 @@ REASONS: dict[str, str] = {
     "launch": "the kernel's launch latency",
     "idle": "the SM had no warp: the start and the tail of a kernel",
 }
+
+#: From this share of issue slots on, issue is the bound: more warps or faster memory would not help
+#: much. Below it the bound is what the other slots waited for.
+ISSUE_BOUND = 0.8
 
 
 @dataclass(frozen=True)
@@ -58,8 +62,9 @@ class PassTiming:
     """One pass: the sum over its kernel launches.
 
     cycles: core cycles from launch to the last CTA's end, the launch latency included.
-    launch_cycles: the launch latencies. where: reason -> cycles; they sum to `cycles`. An SM-cycle
-        counts 1 / SMs; the remainder of the division goes to the largest shares.
+    launch_cycles: the launch latencies. where: reason -> cycles; they sum to `cycles`. An issue
+        slot, the cycle of one scheduler, counts 1 / schedulers of all SMs; the remainder of the
+        division goes to the largest shares.
     warp_instructions: kind -> issued warp instructions ("memory" among them).
     resident_warp_cycles: sum over SMs and cycles of resident warps; sm_cycles: SMs x cycles without
         the launch; max_warps: of one SM. levels: "l1", ("gl1",) "l2", ("llc",) "dram".
@@ -84,8 +89,12 @@ class PassTiming:
 
     @property
     def bottleneck(self) -> str:
-        """The reason with most cycles, the launch left out."""
+        """Issue where it took at least `ISSUE_BOUND` of the cycles after the launch; else what took
+        most of the others.
+        """
         where = {r: n for r, n in self.where.items() if r != "launch"}
+        if where.get("issue", 0) < ISSUE_BOUND * sum(where.values()):
+            where.pop("issue", None)
         return max(where, key=lambda r: where[r]) if any(where.values()) else "launch"
 
     def utilisation(self, level: str) -> float | None:

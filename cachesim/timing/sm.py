@@ -377,15 +377,31 @@ def _next_event(state, index):  # type: ignore[no-untyped-def]
     return _next_timed(sm, now, soonest)
 
 
+@small
+def _find_stall(sm, mine, blocked):  # type: ignore[no-untyped-def]
+    """Why a scheduler whose warps are `mine` does not issue. blocked: 0, or why an access of the SM
+    did not leave its pipe.
+    """
+    if sm.resident & mine == 0:
+        return R_IDLE
+    if sm.ready[MEMORY] & mine:
+        return blocked if blocked > 0 else R_L1_BANDWIDTH
+    if sm.resident & ~sm.blocked & mine:
+        return R_ARITHMETIC
+    return blocked if blocked > 0 else R_MEMORY
+
+
 @compiled
 def step_sm(state, index):  # type: ignore[no-untyped-def]
     """One cycle of an SM; sets the cycle in which it wants to be stepped again."""
     machine = state.pool.machine[0]
     sm = state.sms[index]
     now = machine.now
-    # The cycles it slept through went where its last one did.
+    # The slots it slept through went where its last ones did.
     slept = now - sm.last_step - 1
-    state.reasons[sm.last_reason] += slept
+    if slept > 0:
+        for s in range(machine.num_schedulers):
+            state.reasons[sm.stall[s]] += slept
     sm.last_step = now
     blocked = 0
     has_moved = False
@@ -402,12 +418,16 @@ def step_sm(state, index):  # type: ignore[no-untyped-def]
         _collect(state, index)
         has_moved |= sm.collect_from <= now + 1
     issued = 0
+    issuers = 0
     if sm.num_resident > 0 and not sm.is_stuck:
         ready = sm.ready[0] | sm.ready[1] | sm.ready[2] | sm.ready[3] | sm.ready[4]
         scheduler = now % machine.num_schedulers
         for _ in range(machine.num_schedulers):
             if ready & state.scheduler_masks[scheduler]:
-                issued += _issue(state, index, scheduler)
+                found = _issue(state, index, scheduler)
+                issued += found
+                if found > 0:
+                    issuers |= 1 << scheduler
             scheduler += 1
             if scheduler == machine.num_schedulers:
                 scheduler = 0
@@ -416,21 +436,12 @@ def step_sm(state, index):  # type: ignore[no-untyped-def]
         sm.is_stuck = issued == 0 and (machine.collector_units > 0 or arithmetic == 0)
     if issued > 0:
         machine.progress = now
-        reason = R_ISSUE
-    elif sm.num_resident == 0:
-        reason = R_IDLE
-    elif blocked > 0 and (sm.ready[MEMORY] != 0 or sm.num_blocked < sm.num_resident):
-        reason = blocked
-    elif blocked > R_L1_BANDWIDTH:
-        reason = blocked
-    elif sm.num_blocked < sm.num_resident:
-        reason = R_ARITHMETIC
-    elif blocked > 0:
-        reason = blocked
-    else:
-        reason = R_MEMORY
-    state.reasons[reason] += 1
-    sm.last_reason = reason if reason != R_ISSUE else R_ARITHMETIC
+    for s in range(machine.num_schedulers):
+        sm.stall[s] = _find_stall(sm, state.scheduler_masks[s], blocked)
+        if (issuers >> s) & 1:
+            state.reasons[R_ISSUE] += 1
+        else:
+            state.reasons[sm.stall[s]] += 1
     sm.wake = _next_event(state, index)
     sm.waits_for_room = 0
     if sm.wake == now + 1 and issued == 0 and not has_moved:

@@ -86,7 +86,7 @@ class State(NamedTuple):
     int32.
     ejection: (SMs, room) int32; cta_at: (SMs, places) int64; warps_left: the same.
     fifo: (units, 3, room) int32, the texture L1's reorder buffer, requests and results.
-    scheduler_masks: (schedulers,) uint64. reasons: (reasons,) int64 SM-cycles.
+    scheduler_masks: (schedulers,) uint64. reasons: (reasons,) int64 cycles of schedulers.
     latency: (5, 2) int64, by level that gave the data: sum, number. issued: (5,) int64 by
     kind. resident: (1,) int64 warp-cycles.
     """

@@ -16,9 +16,10 @@ from cachesim.timing.records import MAX_LOADS, MAX_WARPS, MEMORY, NEVER, WAIT, W
 
 
 @small
-def _block(sm, warp, until):  # type: ignore[no-untyped-def]
+def _block(sm, warp, slot, until):  # type: ignore[no-untyped-def]
     warp.waits_for = until
     sm.num_blocked += 1
+    sm.blocked |= bit_at(slot)
 
 
 @compiled
@@ -31,6 +32,7 @@ def _finish(state, index, slot):  # type: ignore[no-untyped-def]
     state.resident[0] += sm.num_resident * (machine.now - sm.resident_since)
     sm.resident_since = machine.now
     sm.num_resident -= 1
+    sm.resident &= ~bit_at(slot)
     place = warp.cta
     state.warps_left[index, place] -= 1
     if state.warps_left[index, place] == 0:
@@ -70,7 +72,7 @@ def schedule(state, index, slot, earliest):  # type: ignore[no-untyped-def]
             if step.kind == WAIT:
                 until = warp.next_load - step.count
                 if warp.oldest_load < until:
-                    _block(sm, warp, until)
+                    _block(sm, warp, slot, until)
                     return
                 warp.operation += 1
                 continue
@@ -87,7 +89,7 @@ def schedule(state, index, slot, earliest):  # type: ignore[no-untyped-def]
             break
         if warp.in_trailer:
             if warp.oldest_load < warp.next_load or warp.stores > 0:
-                _block(sm, warp, warp.next_load)
+                _block(sm, warp, slot, warp.next_load)
                 return
             # A warp leaves when its last instructions have left the pipeline.
             ready = warp.exit_ready
@@ -103,7 +105,7 @@ def schedule(state, index, slot, earliest):  # type: ignore[no-untyped-def]
         if instruction.num_outstanding >= 0:
             until = max(until, warp.next_load - instruction.num_outstanding)
         if warp.oldest_load < until:
-            _block(sm, warp, until)
+            _block(sm, warp, slot, until)
             return
         ready = max(ready, warp.int_ready)
         if instruction.operation == STORE:
@@ -156,8 +158,11 @@ def _unblock(state, warp_index):  # type: ignore[no-untyped-def]
         return
     warp.waits_for = -1
     index = warp_index // MAX_WARPS
-    state.sms[index].num_blocked -= 1
-    schedule(state, index, warp_index % MAX_WARPS, state.pool.machine[0].now)
+    slot = warp_index % MAX_WARPS
+    sm = state.sms[index]
+    sm.num_blocked -= 1
+    sm.blocked &= ~bit_at(slot)
+    schedule(state, index, slot, state.pool.machine[0].now)
 
 
 @compiled
@@ -247,4 +252,5 @@ def start_warp(state, index, slot, place, first, rows, age):  # type: ignore[no-
     state.resident[0] += sm.num_resident * (machine.now - sm.resident_since)
     sm.resident_since = machine.now
     sm.num_resident += 1
+    sm.resident |= bit_at(slot)
     schedule(state, index, slot, machine.now + 2 + machine.cta_launch_cycles)
