@@ -27,7 +27,7 @@ from kernels.gbuffer import GBuffer
 from kernels.maths.profile import cdf
 from kernels.method import Method
 from kernels.opencl.device import Device, open_device
-from kernels.passes.sampling import Constants
+from kernels.passes.constants import Constants
 from traces.errors import InputError
 
 if TYPE_CHECKING:

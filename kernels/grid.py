@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -95,6 +96,18 @@ class Grid:
         """
         x, y = self.lanes
         return image[np.minimum(y, self.height - 1), np.minimum(x, self.width - 1)]
+
+    def scatter(self, values: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        """(height, width, ...): the image of values in lane order, (num_warps, 32, ...)."""
+        empty = np.zeros((self.height, self.width, *values.shape[2:]), values.dtype)
+        return self.scatter_into(empty, values)
+
+    def scatter_into(self, image: npt.NDArray[Any], values: npt.NDArray[Any]) -> npt.NDArray[Any]:
+        """The image with the grid's pixels replaced by values in lane order."""
+        x, y = self.lanes
+        image = image.copy()
+        image[y[self.inside], x[self.inside]] = values[self.inside]
+        return image
 
     def warp_states(self, mask: npt.NDArray[np.bool_] | None = None) -> npt.NDArray[np.int32]:
         """(num_warps,) int32: `OUTSIDE`, `PLAIN`, or 1 where a lane's pixel is in `mask`, (height,

@@ -27,7 +27,7 @@ from kernels.tiles import CLASS_OF_PASS
 from traces.trace import WAIT
 
 if TYPE_CHECKING:
-    from kernels.pipeline import Pipeline
+    from kernels.passes.state import DeviceState
 
 
 class Pass(Protocol):
@@ -36,7 +36,7 @@ class Pass(Protocol):
     def accesses(self, method: Method, frame: int) -> tuple[Access, ...]:
         """The traced accesses of its kernel, in program order."""
 
-    def arguments(self, pipeline: Pipeline, level: int, frame: int) -> list[Any]:
+    def arguments(self, state: DeviceState, level: int, frame: int) -> list[Any]:
         """The kernel's arguments between the warp's and the trace's. level: as in `Step`."""
 
 

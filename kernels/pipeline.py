@@ -18,7 +18,8 @@ from kernels.grid import WARPS_PER_CTA, Grid, lane_table
 from kernels.launches import PASSES, Step, list_steps
 from kernels.method import Method
 from kernels.opencl.device import Device
-from kernels.passes import classify, estimate, pilot, sampling, separable, taa
+from kernels.passes import classify, estimate, pilot, separable, taa
+from kernels.passes.constants import Constants
 from kernels.passes.separable_taps import make_taps
 from kernels.tiles import CLASS_OF_PASS, ListedGrid, count_tiles
 from traces.errors import InputError
@@ -126,9 +127,7 @@ class Pipeline:
         self.jitter = gbuffer.jitter
         self.has_velocity = np.int32(gbuffer.velocity is not None)
         self.has_overlay = np.int32(gbuffer.overlay is not None)
-        self.constants = sampling.Constants.of(
-            self.method, self.width, self.height, gbuffer.projection_x
-        )
+        self.constants = Constants.of(self.method, self.width, self.height, gbuffer.projection_x)
         self.depth_falloff = separable.depth_falloff(gbuffer.projection_x)
         self.buffers["ratio"] = self.upload(self.constants.ratio)
         return True

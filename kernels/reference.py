@@ -32,6 +32,7 @@ from kernels.passes import (
     taa,
     update,
 )
+from kernels.passes.constants import Constants
 from kernels.tiles import CLASS_OF_PASS, ListedGrid
 from traces.texture import WARP_SIZE
 
@@ -77,7 +78,7 @@ def render_reference(
         for name in ("velocity", "overlay"):
             textures.pop(name, None)
         textures |= resources.inputs(gbuffer)
-        constants = sampling.Constants.of(method, width, height, gbuffer.projection_x)
+        constants = Constants.of(method, width, height, gbuffer.projection_x)
         falloff = separable.depth_falloff(gbuffer.projection_x)
         mask = gbuffer.subsurface
         found = ReferenceFrame(textures, np.zeros((height, width), np.uint16))
@@ -102,7 +103,7 @@ def render_reference(
             elif step.pass_name == "sampling":
                 counts = estimate.reference(step.grid, textures, method, constants, frame)
                 states = np.where(states > 0, counts.max(axis=1), states).astype(np.int32)
-                found.counts = scatter(step.grid, counts).astype(np.uint16)
+                found.counts = step.grid.scatter(counts).astype(np.uint16)
                 texels = sampling.reference(
                     step.grid, textures, method, constants, num_levels, frame, counts
                 )
@@ -133,17 +134,3 @@ def render_reference(
         found.textures = dict(textures)
         frames.append(found)
     return frames
-
-
-def scatter(grid: Grid, values: Array) -> Array:
-    """(height, width, ...): the image of values in lane order, (num_warps, 32, ...)."""
-    empty = np.zeros((grid.height, grid.width, *values.shape[2:]), values.dtype)
-    return scatter_into(empty, grid, values)
-
-
-def scatter_into(image: Array, grid: Grid, values: Array) -> Array:
-    """The image with the grid's pixels replaced by values in lane order."""
-    x, y = grid.lanes
-    image = image.copy()
-    image[y[grid.inside], x[grid.inside]] = values[grid.inside]
-    return image

@@ -12,7 +12,7 @@ from cachesim.cost.file import read_models, write_models
 from cachesim.cost.machine import Machine
 from cachesim.cost.model import Coefficient, CostModel, coefficient_names
 from experiments.cli import run_command
-from experiments.reproduce import cost_function
+from experiments.reproduce import cost_function_cells
 from experiments.reproduce.cost_function_verdicts import LEVELS, judge, summarise
 from traces.errors import InputError
 from traces.parquet import write_parquet
@@ -155,7 +155,7 @@ def test_a_model_is_fitted_to_recordings_and_predicts_a_scene(first_device, tmp_
 
 def test_what_is_held_out_was_not_fitted_to():
     for quick in (True, False):
-        cells = cost_function.list_cells(quick)
+        cells = cost_function_cells.list_cells(quick)
         fitted, held = ([c for c in cells if c.held_out == kind] for kind in (False, True))
         assert len(fitted) >= 4 and len(held) >= 4
         assert not {c.scene for c in fitted} & {c.scene for c in held}

@@ -188,7 +188,7 @@ def test_estimators_without_history_put_samples_where_the_light_changes(device, 
 
 
 def test_the_distant_share_is_what_the_profile_scatters_beyond_the_pixel():
-    from kernels.passes.sampling import Constants
+    from kernels.passes.constants import Constants
 
     method = Method()
     constants = Constants.of(method, 1920, 1080, 3.732)

@@ -12,7 +12,7 @@ from kernels.frame import advance, render
 from kernels.grid import Grid
 from kernels.method import Method
 from kernels.passes.classify import radius_at_cm
-from kernels.passes.sampling import Constants
+from kernels.passes.constants import Constants
 from kernels.pipeline import Pipeline
 from kernels.record import estimate_rows, record
 from kernels.reference import render_reference

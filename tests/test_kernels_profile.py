@@ -10,6 +10,7 @@ from kernels.maths.profile import SKIN, Profile
 from kernels.maths.sequence import pcg3d16, r2
 from kernels.method import Method
 from kernels.passes import estimate, sampling
+from kernels.passes.constants import Constants
 from traces.errors import InputError
 
 XI = np.arange(0.0005, 1, 0.0005)
@@ -154,7 +155,7 @@ MIP_TABLE = [
 def test_published_mip_levels(scale, depth_cm, texels_per_mm, levels):
     """1080p, fov 30 degrees; rows n = 8, 16, 64; columns the radius' 50, 90 and 99 % quantile."""
     method = Method(scale=scale)
-    constants = sampling.Constants.of(method, 1920, 1080, 1 / np.tan(np.radians(15)))
+    constants = Constants.of(method, 1920, 1080, 1 / np.tan(np.radians(15)))
     per_mm = constants.texels_per_mm_at_cm / depth_cm
     assert per_mm == pytest.approx(texels_per_mm, rel=4e-3)
     r = profile.inverse_cdf_exact(np.array([0.5, 0.9, 0.99]), SKIN.d_sampled_mm)
@@ -179,7 +180,7 @@ def test_textbook_rule_asks_for_levels_five_to_seven_higher():
     p = profile.pdf(r, SKIN.d_sampled_mm)
     projection = 1 / np.tan(np.radians(15))
     paper, textbook = (
-        sampling.Constants.of(Method(scale="legacy", mip_rule=rule), 1920, 1080, projection)
+        Constants.of(Method(scale="legacy", mip_rule=rule), 1920, 1080, projection)
         for rule in ("eq-5.12", "textbook")
     )
     per_mm = paper.texels_per_mm_at_cm / 20

@@ -11,7 +11,7 @@ from kernels.frame import render
 from kernels.grid import Grid
 from kernels.method import Method
 from kernels.passes import update
-from kernels.passes.sampling import Constants
+from kernels.passes.constants import Constants
 from kernels.selfcheck import small_gbuffer
 
 F = np.float32

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from experiments.reproduce.adaptive_o1_results import EDGE, FLAT, GUIDED, UNGUIDED
 from experiments.reproduce.experiment import Experiment, Outcome, Settings
 
 if TYPE_CHECKING:
@@ -28,13 +29,9 @@ OVERLAY_FRAMES, QUICK_OVERLAY_FRAMES = 160, 32
 REFERENCE_SAMPLES = 1024
 #: Shares of the scattering pixels: those of the steepest and of the most even light.
 EDGE_SHARE, FLAT_SHARE = 0.02, 0.2
-EDGE, FLAT = "shadow edge", "flat area"
 #: Frames until a TAA of weight 0.04 has forgotten where it began, to e^-3.
 SETTLED = 75
 SOURCES = ("kernels", "experiments.reproduce.adaptive_o1", "experiments.reproduce.film")
-#: Of each region in each frame: `measure_estimator`.
-COLUMNS = ("count", "pixel_count", "step", "estimated_error", "true_error", "pilots")
-GUIDED, UNGUIDED = "local guiding + TAA", "TAA alone, 8 samples"
 
 
 def list_estimators() -> dict[str, Method]:

@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from experiments.reproduce.adaptive_o1 import COLUMNS, EDGE, FLAT, GUIDED, UNGUIDED
 from experiments.reproduce.experiment import Comparison
 
 if TYPE_CHECKING:
@@ -16,6 +15,10 @@ if TYPE_CHECKING:
     from experiments.reproduce.film import Mask
     from experiments.reproduce.parts import Arrays
 
+EDGE, FLAT = "shadow edge", "flat area"
+#: Of each region in each frame: `adaptive_o1.measure_estimator`.
+COLUMNS = ("count", "pixel_count", "step", "estimated_error", "true_error", "pilots")
+GUIDED, UNGUIDED = "local guiding + TAA", "TAA alone, 8 samples"
 PAPER, LAST, ENGINE = "paper, kappa 0.2", "last frame alone", "engine"
 #: A value within this factor of the printed one agrees with it.
 AGREES_WITHIN = 1.5

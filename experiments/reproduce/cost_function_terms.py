@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from cachesim.config import Gpu
     from cachesim.cost.fit import Observation
     from cachesim.cost.model import CostModel, Prepared
-    from experiments.reproduce.cost_function import Cell
+    from experiments.reproduce.cost_function_cells import Cell
 
 
 def make_terms(

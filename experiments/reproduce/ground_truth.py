@@ -10,7 +10,7 @@ slab, a ball and meshes answers where Mitsuba is installed.
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from experiments.reproduce.experiment import Experiment, Outcome, Settings
+from experiments.reproduce.ground_truth_study import Study
 from experiments.reproduce.ground_truth_verdicts import EXACT, PUBLISHED, SEPARABLE, SLAB
 
 if TYPE_CHECKING:
@@ -43,16 +44,6 @@ VOLUME_SOURCES = (
 )
 #: The counts that stand in the pictures.
 SHOWN_SAMPLES, SHOWN_TAPS = 64, 27
-
-
-@dataclass(frozen=True, eq=False)
-class Study:
-    """One scene. dense: (h, w, 3) float32 scattered light. shown: the same of the methods."""
-
-    name: str
-    gbuffer: GBuffer
-    dense: npt.NDArray[np.float32]
-    shown: dict[str, npt.NDArray[np.float32]]
 
 
 def list_methods(quick: bool) -> dict[str, list[tuple[int, Method]]]:

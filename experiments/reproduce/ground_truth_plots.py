@@ -14,7 +14,7 @@ from kernels.picture import tone_map
 if TYPE_CHECKING:
     import pandas as pd
 
-    from experiments.reproduce.ground_truth import Study
+    from experiments.reproduce.ground_truth_study import Study
     from experiments.reproduce.ground_truth_volume import Compared
 
 _MARKERS = ("o", "s", "^")

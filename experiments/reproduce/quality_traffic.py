@@ -106,7 +106,7 @@ def run(settings: Settings) -> Outcome:
     size = f"{width}x{height}"
     figures = {
         f"{scene}-{metric}": traffic_figure(
-            frame[frame["scene"] == scene], metric, f"{scene}, {size}"
+            frame[frame["scene"] == scene], metric, f"{scene}, {size}", TRAFFIC
         )
         for scene in scenes
         for metric in ("psnr", "flip")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 from matplotlib.figure import Figure
@@ -9,7 +10,6 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from experiments.plots import FONT_SIZE, PALETTE
 from experiments.reproduce.gpu_generations import GPUS
-from experiments.reproduce.quality_traffic import TRAFFIC
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -22,14 +22,16 @@ LOG_FROM = 4.0
 _METRICS = {"psnr": ("psnr_db", "PSNR (dB)"), "flip": ("flip", "FLIP")}
 
 
-def traffic_figure(frame: pd.DataFrame, metric: str, title: str) -> Figure:
-    """One scene. metric: "psnr" or "flip"."""
+def traffic_figure(
+    frame: pd.DataFrame, metric: str, title: str, traffic: Mapping[str, str]
+) -> Figure:
+    """One scene. metric: "psnr" or "flip". traffic: column of bytes -> what it is called."""
     column, label = _METRICS[metric]
     gpus = [name for name in GPUS if name in set(frame["gpu"])]
     methods = list(dict.fromkeys(frame["method"]))
     figure = Figure(figsize=(2.35 * len(gpus) + 0.4, 5.0), layout="constrained")
-    grid = figure.subplots(len(TRAFFIC), len(gpus), squeeze=False, sharey=True, sharex="row")
-    for number, (quantity, words) in enumerate(TRAFFIC.items()):
+    grid = figure.subplots(len(traffic), len(gpus), squeeze=False, sharey=True, sharex="row")
+    for number, (quantity, words) in enumerate(traffic.items()):
         for axes, gpu in zip(grid[number], gpus, strict=True):
             for i, method in enumerate(methods):
                 own = frame[(frame["gpu"] == gpu) & (frame["method"] == method)]

@@ -31,8 +31,8 @@ from kernels.tiles import EMPTY, PASSTHROUGH, SAMPLED, SEPARABLE, count_tiles
 from traces.texture import INACTIVE_TEXEL, WARP_SIZE, pack_texel
 
 if TYPE_CHECKING:
-    from kernels.passes.sampling import Constants
-    from kernels.pipeline import Pipeline
+    from kernels.passes.constants import Constants
+    from kernels.passes.state import DeviceState
 
 _F = np.float32
 #: Mean radius of Burley's profile over its scale d. Facts sheet 2.1.
@@ -72,13 +72,13 @@ def accesses(method: Method, frame: int) -> tuple[Access, ...]:
     )
 
 
-def arguments(pipeline: Pipeline, level: int, frame: int) -> list[Any]:
+def arguments(state: DeviceState, level: int, frame: int) -> list[Any]:
     """The kernel's arguments between the warp's and the trace's."""
     names = ("setup", "counts", "velocity", "importance", "tile_class", "tex", "scattered")
-    method = pipeline.method
+    method = state.method
     return [
-        *(pipeline.buffers[name] for name in names),
-        pipeline.has_velocity,
+        *(state.buffers[name] for name in names),
+        state.has_velocity,
         np.int32(method.num_samples),
         np.int32("count" in method.hybrid_rules),
         np.int32("radius" in method.hybrid_rules),
@@ -86,7 +86,7 @@ def arguments(pipeline: Pipeline, level: int, frame: int) -> list[Any]:
         _F(method.radius_threshold_px),
         np.uint32(importance_code(method)),
         _F(method.passthrough_px),
-        radius_at_cm(method, pipeline.constants),
+        radius_at_cm(method, state.constants),
     ]
 
 
@@ -102,8 +102,6 @@ def reference(
 
     counts: (num_warps, 32) samples of each lane, 0 where nothing scatters.
     """
-    from kernels.reference import scatter_into
-
     texel = np.where(grid.inside[..., None], grid.gather(textures["setup"][0]), 0).astype(_F)
     scatters = texel[..., 3] > 0
 
@@ -140,7 +138,7 @@ def reference(
     for name, mask, value in written:
         before = grid.gather(textures[name])
         kept = np.where(mask[..., None], value, before)
-        textures[name] = scatter_into(textures[name], grid, kept)
+        textures[name] = grid.scatter_into(textures[name], kept)
 
     first = np.zeros((grid.num_warps, WARP_SIZE), np.bool_)
     first[::WARPS_PER_CTA, 0] = True

@@ -14,7 +14,7 @@ from kernels.method import Method
 from kernels.passes.setup import texels
 
 if TYPE_CHECKING:
-    from kernels.pipeline import Pipeline
+    from kernels.passes.state import DeviceState
 
 
 def result_name(method: Method) -> str:
@@ -33,11 +33,11 @@ def accesses(method: Method, frame: int) -> tuple[Access, ...]:
     )
 
 
-def arguments(pipeline: Pipeline, level: int, frame: int) -> list[Any]:
+def arguments(state: DeviceState, level: int, frame: int) -> list[Any]:
     """The kernel's arguments between the warp's and the trace's."""
-    result = result_name(pipeline.method)
+    result = result_name(state.method)
     names = ("scene_colour", "profile_id", result, "albedo", "output")
-    return [pipeline.buffers[name] for name in names]
+    return [state.buffers[name] for name in names]
 
 
 def reference(grid: Grid, textures: dict[str, Any], method: Method) -> list[npt.NDArray[np.uint32]]:

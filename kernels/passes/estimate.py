@@ -26,7 +26,7 @@ from kernels.passes.history import (
 )
 
 if TYPE_CHECKING:
-    from kernels.pipeline import Pipeline
+    from kernels.passes.state import DeviceState
 
 _F = np.float32
 _ONE = _F(1)
@@ -47,20 +47,20 @@ def accesses(method: Method, frame: int) -> tuple[Access, ...]:
     return found
 
 
-def arguments(pipeline: Pipeline, frame: int) -> list[Any]:
+def arguments(state: DeviceState, frame: int) -> list[Any]:
     """The kernel's arguments behind the warp's."""
-    method, constants = pipeline.method, pipeline.constants
+    method, constants = state.method, state.constants
     history = "pilot" if method.takes_pilots else history_names(frame)[0]
     names = ("setup", "velocity", history, "counts")
     return [
-        *(pipeline.buffers[name] for name in names),
-        pipeline.has_velocity,
+        *(state.buffers[name] for name in names),
+        state.has_velocity,
         np.float32(method.sigma0_sq),
         np.float32(_kappa(method)),
         np.float32(k_minus_1(method)),
         np.float32(method.b_min),
         np.float32(method.b_max),
-        pipeline.buffers[names_of("past_counts", frame)[0]],
+        state.buffers[names_of("past_counts", frame)[0]],
         np.int32(method.num_past_frames),
         constants.texels_per_mm_at_cm,
         constants.rate[3],

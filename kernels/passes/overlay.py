@@ -18,7 +18,7 @@ from kernels.method import Method
 from kernels.passes.setup import texels
 
 if TYPE_CHECKING:
-    from kernels.pipeline import Pipeline
+    from kernels.passes.state import DeviceState
 
 
 def accesses(method: Method, frame: int) -> tuple[Access, ...]:
@@ -26,9 +26,9 @@ def accesses(method: Method, frame: int) -> tuple[Access, ...]:
     return (Access("overlay"), Access("output"), Access("output", "store"))
 
 
-def arguments(pipeline: Pipeline, level: int, frame: int) -> list[Any]:
+def arguments(state: DeviceState, level: int, frame: int) -> list[Any]:
     """The kernel's arguments between the warp's and the trace's."""
-    return [pipeline.buffers["overlay"], pipeline.buffers["output"], pipeline.has_overlay]
+    return [state.buffers["overlay"], state.buffers["output"], state.has_overlay]
 
 
 def reference(grid: Grid, textures: dict[str, Any]) -> list[npt.NDArray[np.uint32]]:

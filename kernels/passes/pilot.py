@@ -16,9 +16,10 @@ from kernels.access import Access, States
 from kernels.grid import Grid
 from kernels.method import Method
 from kernels.passes import estimate, sampling
+from kernels.passes.constants import Constants
 
 if TYPE_CHECKING:
-    from kernels.pipeline import Pipeline
+    from kernels.passes.state import DeviceState
 
 
 def warp_states(states: States, method: Method) -> States:
@@ -33,17 +34,17 @@ def accesses(method: Method, frame: int) -> tuple[Access, ...]:
     return (*before, *loop, Access("pilot", "store"))
 
 
-def arguments(pipeline: Pipeline, level: int, frame: int) -> list[Any]:
+def arguments(state: DeviceState, level: int, frame: int) -> list[Any]:
     """The kernel's arguments between the warp's and the trace's."""
     number = frame | sampling.PILOT_FRAMES
-    return sampling.arguments_for(pipeline, pipeline.method.num_pilots, number, "pilot")
+    return sampling.arguments_for(state, state.method.num_pilots, number, "pilot")
 
 
 def reference(
     grid: Grid,
     textures: dict[str, Any],
     method: Method,
-    constants: sampling.Constants,
+    constants: Constants,
     num_levels: int,
     frame: int,
 ) -> list[npt.NDArray[np.uint32]]:

@@ -20,7 +20,7 @@ from kernels.passes.setup import texels
 from traces.texture import INACTIVE_TEXEL, pack_texel
 
 if TYPE_CHECKING:
-    from kernels.pipeline import Pipeline
+    from kernels.passes.state import DeviceState
 
 
 def accesses(method: Method, frame: int) -> tuple[Access, ...]:
@@ -41,10 +41,10 @@ def find_taps(source_size: int, size: int) -> tuple[Any, Any, Any]:
     return left, np.minimum(left + 1, source_size - 1), weight
 
 
-def arguments(pipeline: Pipeline, level: int, frame: int) -> list[Any]:
+def arguments(state: DeviceState, level: int, frame: int) -> list[Any]:
     """The kernel's arguments between the warp's and the trace's."""
-    size = (np.int32(pipeline.width), np.int32(pipeline.height))
-    return [pipeline.buffers["setup"], np.uint32(level), *size]
+    size = (np.int32(state.width), np.int32(state.height))
+    return [state.buffers["setup"], np.uint32(level), *size]
 
 
 def reference(grid: Grid, textures: dict[str, Any], level: int) -> list[npt.NDArray[np.uint32]]:

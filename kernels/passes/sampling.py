@@ -12,7 +12,6 @@ The pilot pass is the same kernel with few samples, which writes nothing else.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -26,6 +25,7 @@ from kernels.maths.profile import APPROXIMATE_C
 from kernels.maths.sequence import pcg3d16, r2
 from kernels.method import Method
 from kernels.passes import estimate
+from kernels.passes.constants import Constants
 from kernels.passes.history import history_names, reproject
 from kernels.passes.patch import PATCH_PARTS, is_held, patch_accesses, patch_texels
 from kernels.passes.setup import texels
@@ -33,7 +33,7 @@ from kernels.passes.spread import find_spread, weigh
 from traces.texture import INACTIVE_TEXEL, pack_texel
 
 if TYPE_CHECKING:
-    from kernels.pipeline import Pipeline
+    from kernels.passes.state import DeviceState
 
 _F = np.float32
 _ONE = _F(1)
@@ -41,51 +41,7 @@ _PDF_MIN = _F(1e-5)
 _RADIUS_MIN = _F(1e-5)
 _MM_PER_CM = _F(10)
 _C = _F(APPROXIMATE_C)
-#: The constant `a` of Eq 5.12, chosen by its author to damp the influence of the count.
-MIP_DAMPING = 1.0 / 16.0
 Texels = npt.NDArray[np.uint32]
-
-
-@dataclass(frozen=True)
-class Constants:
-    """The pass's numbers that one picture fixes, as float32.
-
-    texels_per_mm_at_cm: texels per mm at a depth of 1 cm. d: the sampled channel's profile scale,
-    mm. rate, density: -1 / (3 d), 1/mm, and 1 / (4 d), 1/mm, of red, green, blue and the sampled
-    channel. mip_scale: the mip rule's factor. ratio: (num_levels, 2), width and height of each
-    level over those of level 0.
-    """
-
-    texels_per_mm_at_cm: np.float32
-    d: np.float32
-    rate: npt.NDArray[np.float32]
-    density: npt.NDArray[np.float32]
-    mip_scale: np.float32
-    ratio: npt.NDArray[np.float32]
-
-    @staticmethod
-    def of(method: Method, width: int, height: int, projection_x: float) -> Constants:
-        """The constants for a frame. projection_x: 1 / tan(fov_x / 2)."""
-        profile = method.profile
-        d = np.array([*profile.d_mm, profile.d_sampled_mm])
-        # Facts sheet 2.5: UV per mm at depth z is 0.05 M / z, or M / (6 z) in the engine before its
-        # correction.
-        step = 0.05 if method.scale == "physical" else 1.0 / 6.0
-        if method.mip_rule == "textbook":
-            mip_scale = 1.0 / (2.0 * np.pi)
-        else:
-            # a / lmax^2 / t, t = (texels per mm)^2 / (width height).
-            mip_scale = MIP_DAMPING * width * height / profile.dmfp_max_mm**2
-        levels = range(resources.count_levels(width, height, method))
-        ratio = [[_F(width >> k) / _F(width), _F(height >> k) / _F(height)] for k in levels]
-        return Constants(
-            _F(width * step * projection_x),
-            _F(d[3]),
-            (-1.0 / (3.0 * d)).astype(np.float32),
-            (1.0 / (4.0 * d)).astype(np.float32),
-            _F(mip_scale),
-            np.array(ratio, np.float32),
-        )
 
 
 #: Set in the hash's frame number for pilots, so that the samples proper are others.
@@ -145,30 +101,30 @@ def find_level(q: Any, num_levels: int) -> Any:
     return np.minimum(finer, num_levels - 1)
 
 
-def arguments(pipeline: Pipeline, level: int, frame: int) -> list[Any]:
+def arguments(state: DeviceState, level: int, frame: int) -> list[Any]:
     """The kernel's arguments between the warp's and the trace's."""
-    return arguments_for(pipeline, pipeline.method.num_samples, frame, "scattered")
+    return arguments_for(state, state.method.num_samples, frame, "scattered")
 
 
-def arguments_for(pipeline: Pipeline, num_samples: int, frame: int, target: str) -> list[Any]:
+def arguments_for(state: DeviceState, num_samples: int, frame: int, target: str) -> list[Any]:
     """Those of a run with a fixed count, num_samples (unless counts adapt), into a texture."""
     names = ("setup", "normal", "profile_id", "counts", "velocity", target)
-    constants = pipeline.constants
+    constants = state.constants
     return [
-        *(pipeline.buffers[name] for name in names),
-        pipeline.has_velocity,
+        *(state.buffers[name] for name in names),
+        state.has_velocity,
         np.int32(num_samples),
         np.uint32(frame),
-        np.int32(pipeline.num_levels),
-        pipeline.buffers["ratio"],
+        np.int32(state.num_levels),
+        state.buffers["ratio"],
         constants.texels_per_mm_at_cm,
         constants.d,
         *constants.rate,
         *constants.density,
         constants.mip_scale,
-        pipeline.buffers[history_names(frame)[1]],
-        np.float32(pipeline.method.epsilon_u or 0.0),
-        *(pipeline.buffers[name] for name in ("setup", "normal", "profile_id") * len(PATCH_PARTS)),
+        state.buffers[history_names(frame)[1]],
+        np.float32(state.method.epsilon_u or 0.0),
+        *(state.buffers[name] for name in ("setup", "normal", "profile_id") * len(PATCH_PARTS)),
     ]
 
 
@@ -185,8 +141,6 @@ def reference(
     """Write `scattered` (with `pilots`, `pilot` instead); the texels of each access, those of the
     loop (num_steps, num_warps, 32).
     """
-    from kernels.reference import scatter, scatter_into
-
     x, y = grid.lanes
     centre = np.where(grid.inside[..., None], grid.gather(textures["setup"][0]), 0).astype(_F)
     scatters = counts > 0
@@ -283,13 +237,13 @@ def reference(
             texel = np.stack([counts.astype(_F), centre[..., 3], spread, mean], axis=-1)
             texel = np.where(scatters[..., None], texel, _F(0))
             name = "pilot" if pilots else history_names(frame)[1]
-            textures[name] = scatter(grid, resources.to_half(texel))
+            textures[name] = grid.scatter(resources.to_half(texel))
     result[..., 3] = counts
     if not pilots:
         # With separation, what takes no samples keeps its light; elsewhere that is 0 already.
         unsampled = np.where(np.arange(4) < 3, centre, _F(0)) if method.separates else _F(0)
         result = np.where(scatters[..., None], result, unsampled)
-        textures["scattered"] = scatter_into(textures["scattered"], grid, resources.to_half(result))
+        textures["scattered"] = grid.scatter_into(textures["scattered"], resources.to_half(result))
 
     found: list[Texels] = []
     loop = iter(np.array(plane) for plane in fetched)

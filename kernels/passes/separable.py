@@ -25,8 +25,8 @@ from kernels.passes.setup import texels
 from traces.texture import INACTIVE_TEXEL, pack_texel
 
 if TYPE_CHECKING:
-    from kernels.passes.sampling import Constants
-    from kernels.pipeline import Pipeline
+    from kernels.passes.constants import Constants
+    from kernels.passes.state import DeviceState
 
 _F = np.float32
 _ONE = _F(1)
@@ -70,13 +70,13 @@ class Separable:
             Access(self.target, "store"),
         )
 
-    def arguments(self, pipeline: Pipeline, level: int, frame: int) -> list[Any]:
+    def arguments(self, state: DeviceState, level: int, frame: int) -> list[Any]:
         """The kernel's arguments between the warp's and the trace's."""
         names = (self.source, "profile_id", self.target, "taps")
         return [
-            *(pipeline.buffers[name] for name in names),
-            pipeline.constants.texels_per_mm_at_cm,
-            pipeline.depth_falloff,
+            *(state.buffers[name] for name in names),
+            state.constants.texels_per_mm_at_cm,
+            state.depth_falloff,
         ]
 
     def reference(
@@ -90,8 +90,6 @@ class Separable:
         """Write the grid's pixels of `tex` or `scattered`; the texels of each access, those of the
         loop (num_steps, num_warps, 32).
         """
-        from kernels.reference import scatter_into
-
         image = textures[self.source] if self.vertical else textures[self.source][0]
         source, ids = image.astype(_F), textures["profile_id"] > 0
         centre = np.where(grid.inside[..., None], grid.gather(source), _F(0))
@@ -129,7 +127,7 @@ class Separable:
         result = np.concatenate([sums / totals, fourth[..., None]], axis=-1)
         result = np.where(scatters[..., None], result, _F(0))
         encode = resources.to_half if self.vertical else resources.to_setup
-        textures[self.target] = scatter_into(textures[self.target], grid, encode(result))
+        textures[self.target] = grid.scatter_into(textures[self.target], encode(result))
 
         everywhere, loop = texels(grid, grid.inside), np.array(fetched)
         found = self.accesses(method, 0)

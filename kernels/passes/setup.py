@@ -14,7 +14,7 @@ from kernels.method import Method
 from traces.texture import pack_texel
 
 if TYPE_CHECKING:
-    from kernels.pipeline import Pipeline
+    from kernels.passes.state import DeviceState
 
 
 def accesses(method: Method, frame: int) -> tuple[Access, ...]:
@@ -28,10 +28,10 @@ def accesses(method: Method, frame: int) -> tuple[Access, ...]:
     )
 
 
-def arguments(pipeline: Pipeline, level: int, frame: int) -> list[Any]:
+def arguments(state: DeviceState, level: int, frame: int) -> list[Any]:
     """The kernel's arguments between the warp's and the trace's."""
     names = ("scene_light", "depth", "gbuffer_id", "setup", "profile_id")
-    return [pipeline.buffers[name] for name in names]
+    return [state.buffers[name] for name in names]
 
 
 def reference(grid: Grid, textures: dict[str, Any]) -> list[npt.NDArray[np.uint32]]:

@@ -26,7 +26,7 @@ from kernels.passes.setup import texels
 from traces.texture import INACTIVE_TEXEL, pack_texel
 
 if TYPE_CHECKING:
-    from kernels.pipeline import Pipeline
+    from kernels.passes.state import DeviceState
 
 _F = np.float32
 NUM_STEPS = 9
@@ -58,15 +58,15 @@ def warp_states(states: States) -> States:
     return np.where(states == OUTSIDE, OUTSIDE, NUM_STEPS).astype(np.int32)
 
 
-def arguments(pipeline: Pipeline, level: int, frame: int) -> list[Any]:
+def arguments(state: DeviceState, level: int, frame: int) -> list[Any]:
     """The kernel's arguments between the warp's and the trace's."""
     old, new = texture_names(frame)
     names = ("depth", "output", "velocity", old, new)
     return [
-        *(pipeline.buffers[name] for name in names),
-        pipeline.has_velocity,
-        np.float32(pipeline.method.taa_weight),
-        np.float32(pipeline.method.alpha),
+        *(state.buffers[name] for name in names),
+        state.has_velocity,
+        np.float32(state.method.taa_weight),
+        np.float32(state.method.alpha),
         np.float32(FULL_SPEED),
     ]
 
@@ -75,8 +75,6 @@ def reference(
     grid: Grid, textures: dict[str, Any], method: Method, frame: int
 ) -> list[npt.NDArray[np.uint32]]:
     """Write the frame's texture; the texels of each access, (9, num_warps, 32) for the loop's."""
-    from kernels.reference import scatter
-
     old_name, new_name = texture_names(frame)
     x, y = grid.lanes
     picture = textures["output"].astype(_F)
@@ -122,7 +120,7 @@ def reference(
     mixed = (centre * of_new + history * of_old) / (of_new + of_old)
     luma, co, cg = mixed[..., 0], mixed[..., 1], mixed[..., 2]
     shown = np.stack([luma - cg + co, luma + cg, luma - cg - co, np.ones_like(luma)], axis=-1)
-    textures[new_name] = scatter(grid, resources.to_half(np.maximum(shown, _F(0))))
+    textures[new_name] = grid.scatter(resources.to_half(np.maximum(shown, _F(0))))
 
     loop = np.stack(near_texels)
     own = np.where(grid.inside, pack_texel(0, nearest_y, nearest_x), INACTIVE_TEXEL)

@@ -39,7 +39,7 @@ from kernels.passes.setup import texels
 from traces.texture import INACTIVE_TEXEL, pack_texel
 
 if TYPE_CHECKING:
-    from kernels.pipeline import Pipeline
+    from kernels.passes.state import DeviceState
 
 _F = np.float32
 _ONE = _F(1)
@@ -70,9 +70,9 @@ def accesses(method: Method, frame: int) -> tuple[Access, ...]:
     )
 
 
-def arguments(pipeline: Pipeline, level: int, frame: int) -> list[Any]:
+def arguments(state: DeviceState, level: int, frame: int) -> list[Any]:
     """The kernel's arguments between the warp's and the trace's."""
-    method, constants = pipeline.method, pipeline.constants
+    method, constants = state.method, state.constants
     old, new = history_names(frame)
     names = ("scattered", "velocity", "depth", old, "resolved", new)
     more = (
@@ -81,14 +81,14 @@ def arguments(pipeline: Pipeline, level: int, frame: int) -> list[Any]:
         *names_of("past_counts", frame),
     )
     return [
-        *(pipeline.buffers[name] for name in names),
-        pipeline.has_velocity,
+        *(state.buffers[name] for name in names),
+        state.has_velocity,
         np.float32(method.alpha),
         np.float32(method.sigma0_sq),
-        *(pipeline.buffers[name] for name in more),
+        *(state.buffers[name] for name in more),
         *mask_of(min(method.num_past_frames, MAX_PAST_FRAMES)),
         np.float32(method.num_past_frames),
-        *(np.float32(offset) for offset in pipeline.jitter),
+        *(np.float32(offset) for offset in state.jitter),
         np.float32(method.eta_cov),
         np.float32(method.epsilon_a),
         constants.texels_per_mm_at_cm,
@@ -131,10 +131,8 @@ def reference(
 ) -> list[npt.NDArray[np.uint32]]:
     """Write `resolved` and the frame's history; the texels of each access.
 
-    constants: `sampling.Constants`. jitter: the camera's, texels.
+    constants: `Constants`. jitter: the camera's, texels.
     """
-    from kernels.reference import scatter
-
     old_name, new_name = history_names(frame)
     colour = grid.gather(textures["scattered"]).astype(_F)
     scatters = grid.inside & (colour[..., 3] > 0)
@@ -187,15 +185,15 @@ def reference(
         names = names_of("past_counts", frame)
         past = read_past_counts(textures[names[0]], past_x, past_y, on_screen)
         past = push_count(past, colour[..., 3], known)
-        textures[names[1]] = scatter(grid, np.where(scatters[..., None], past, np.uint32(0)))
+        textures[names[1]] = grid.scatter(np.where(scatters[..., None], past, np.uint32(0)))
         count = mean_of_past(past, method.num_past_frames)
     found[new_name] = np.stack([count, depth, variance, mean], axis=-1)
     for name, values in found.items():
         kept = np.where(scatters[..., None], values, _F(0))
-        textures[name] = scatter(grid, resources.to_half(kept))
+        textures[name] = grid.scatter(resources.to_half(kept))
 
     colour[..., 3] = scatters
-    textures["resolved"] = scatter(grid, resources.to_half(colour))
+    textures["resolved"] = grid.scatter(resources.to_half(colour))
 
     everywhere, mine = texels(grid, grid.inside), texels(grid, scatters)
     past_texels = np.where(on_screen, pack_texel(0, past_y, past_x), INACTIVE_TEXEL)
