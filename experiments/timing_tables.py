@@ -39,7 +39,7 @@ LEVEL_NAMES = {"l1": "L1", "gl1": "GL1", "l2": "L2", "llc": "LLC", "dram": "DRAM
 
 def timing_refusal(gpu: Gpu, fetch_path: str = "texture") -> str | None:
     """Why the timing model cannot run a GPU, in one line; None where it can."""
-    from cachesim.timing.machine import check_timing
+    from cachesim.timing.refusals import check_timing
     from traces.errors import InputError
 
     try:

@@ -10,8 +10,9 @@ import numpy.typing as npt
 
 from cachesim import presets
 from cachesim.config import Gpu
-from cachesim.timing import engine, machine
+from cachesim.timing import engine
 from cachesim.timing.clock import Clock
+from cachesim.timing.room import with_more_room
 from cachesim.timing.state import State
 from traces.lane_address import lane_address_trace
 from traces.texture import INACTIVE_ADDRESS, WARP_SIZE
@@ -179,7 +180,7 @@ def stepped(trace: Trace, gpu: Gpu, path: str | None = None) -> Iterator[State]:
     while True:
         why = engine.run(clock.state, clock.cycles + 1)
         if why == engine.NEEDS_ROOM:
-            clock.state = machine.with_more_room(clock.state)
+            clock.state = with_more_room(clock.state)
             continue
         assert why in (engine.DONE, engine.PAUSED)
         yield clock.state

@@ -21,6 +21,7 @@ from cachesim.timing import engine, machine, records
 from cachesim.timing.feed import Feed
 from cachesim.timing.outcome import Snapshot, dirty_sectors, passes_of, raw_counters
 from cachesim.timing.results import PassTiming, TimingResult
+from cachesim.timing.room import with_more_room
 from traces.errors import WorkError
 from traces.texture import MAX_MIPS
 from traces.trace import Chunk, Launch, Trace
@@ -201,7 +202,7 @@ class Clock:
             if why in (engine.DONE, engine.NEEDS_CTAS):
                 return
             if why == engine.NEEDS_ROOM:
-                self.state = machine.with_more_room(self.state)
+                self.state = with_more_room(self.state)
             elif why == engine.STUCK:
                 raise WorkError(f"the timing model is stuck: {self.describe_stuck()}")
             self._on_cycle(self.cycles)

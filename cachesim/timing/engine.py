@@ -14,11 +14,11 @@ from cachesim.timing.access import DOWN, OUT, book, drop_request, take_request
 from cachesim.timing.dram import is_idle, next_delay, step_channel
 from cachesim.timing.network import AT_INPUTS, arrival, has_room, pop, push, transfer
 from cachesim.timing.partition import is_filling_table, locate
-from cachesim.timing.pipe import inject
 from cachesim.timing.records import NEVER, PATH_FIFO, S_REPLY, S_REQUEST, WRITEBACK
 from cachesim.timing.slice import arrive, come_back, step_cache, took_down, took_out
 from cachesim.timing.sm import place_ctas, step_sm
 from cachesim.timing.state import State
+from cachesim.timing.uplink import inject
 from cachesim.timing.view import opener, prefetch, table_of
 
 _open_state = opener("State")

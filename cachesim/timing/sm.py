@@ -5,34 +5,26 @@ from __future__ import annotations
 import numpy as np
 
 from cachesim.compiled import compiled, small
-from cachesim.stream import STORE
 from cachesim.timing.bits import bit_at, lowest, without_lowest
+from cachesim.timing.collectors import collect, enter_collectors
 from cachesim.timing.pipe import book_sleep, step_pipe
 from cachesim.timing.records import (
-    CONTROL,
-    FP32,
     INT,
-    MAX_LOADS,
     MAX_WARPS,
     MEMORY,
     NEVER,
-    PATH_BYPASS,
     R_ARITHMETIC,
     R_IDLE,
     R_INTERCONNECT,
     R_ISSUE,
     R_L1_BANDWIDTH,
     R_MEMORY,
-    SFU,
     WHEEL,
 )
-from cachesim.timing.warp import advance, is_exit, schedule, start_warp, wake_timed
+from cachesim.timing.units import AHEAD, note_access, unit_of
+from cachesim.timing.warp import advance, is_exit, start_warp, wake_timed
 
 U64 = np.uint64
-#: An instruction may issue this many cycles before its unit is free: it is collected meanwhile.
-_AHEAD = 3
-#: The order in which a port of GPGPU-Sim's operand collectors looks for instructions.
-_PORT_ORDER = (FP32, SFU, MEMORY, INT)
 
 
 @small
@@ -59,178 +51,16 @@ def _pick(state, index, scheduler, candidates):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _note_access(state, warp, row):  # type: ignore[no-untyped-def]
-    """What the warp will wait for: a load's sectors, or a store's acknowledgements. Returns the
-    load's number.
-    """
-    machine = state.pool.machine[0]
-    instruction = state.work.instructions[row.code]
-    if instruction.operation == STORE:
-        parts = machine.line_parts if instruction.path == PATH_BYPASS else 1
-        warp.stores += max(1, row.sectors * parts)
-        return 0
-    load = warp.next_load
-    warp.pending[load & (MAX_LOADS - 1)] = max(1, row.sectors)
-    warp.next_load += 1
-    return load
-
-
-@small
-def _unit_of(machine, kind):  # type: ignore[no-untyped-def]
-    """The unit that executes a kind; GPGPU-Sim's control instructions take the fp32 one."""
-    if kind == CONTROL and machine.collector_units > 0:
-        kind = INT
-    return FP32 if kind == INT and machine.int_on_fp32 else kind
-
-
-@compiled
-def _dispatch(state, index, s, c):  # type: ignore[no-untyped-def]
-    """Move a collected instruction to its unit, if that has room. Returns whether it did."""
-    machine = state.pool.machine[0]
-    sm = state.sms[index]
-    now = machine.now
-    kind = sm.collector_kind[c, s]
-    if kind == MEMORY:
-        if sm.queue_count[s] > 0:
-            return False
-        sm.queue_head[s] = 0
-        sm.queue_count[s] = 1
-        sm.queue_warp[0, s] = sm.collector_slot[c, s]
-        # The load/store unit takes the oldest of those that are there.
-        sm.queue_time[0, s] = sm.collector_order[c, s]
-        sm.queue_row[0, s] = sm.collector_row[c, s]
-        sm.queue_load[0, s] = sm.collector_load[c, s]
-    else:
-        unit = _unit_of(machine, kind)
-        # One instruction may wait between collector and unit.
-        if sm.unit_free[unit, s] - state.latencies[kind, 1] > now:
-            return False
-        slot = sm.collector_slot[c, s]
-        warp = state.warps[index * MAX_WARPS + slot]
-        is_last = sm.collector_chain[c, s] < 0
-        start = max(now + 1, sm.unit_free[unit, s])
-        sm.unit_free[unit, s] = start + (1 if is_last else state.latencies[kind, 1])
-        done = start + state.latencies[kind, 0] + machine.result_cycles - _AHEAD
-        if is_last:
-            warp.exit_ready = start + machine.result_cycles - _AHEAD + 1
-        else:
-            warp.chains_ready[sm.collector_chain[c, s]] = done
-        if kind == INT:
-            warp.int_ready = done
-        if warp.waits_chain >= 0:
-            warp.waits_chain = -1
-            schedule(state, index, slot, now + 1)
-    sm.collector_slot[c, s] = -1
-    sm.num_collecting -= 1
-    return True
-
-
-@compiled
-def _allocate(state, index, kind):  # type: ignore[no-untyped-def]
-    """Give the oldest issued instruction of a kind a collector of its scheduler, if one is free."""
-    machine = state.pool.machine[0]
-    sm = state.sms[index]
-    if sm.num_issued[kind] == 0:
-        return False
-    oldest, order = -1, NEVER
-    for s in range(machine.num_schedulers):
-        if sm.issued_slot[kind, s] >= 0 and sm.issued_order[kind, s] < order:
-            oldest, order = s, sm.issued_order[kind, s]
-    if oldest < 0:
-        return False
-    for c in range(machine.collector_units):
-        if sm.collector_slot[c, oldest] >= 0:
-            continue
-        sm.collector_slot[c, oldest] = sm.issued_slot[kind, oldest]
-        sm.collector_kind[c, oldest] = sm.issued_kind[kind, oldest]
-        # One operand is read a step: arithmetic has two, a memory instruction its address, an exit
-        # none.
-        exits = sm.issued_chain[kind, oldest] < 0
-        sm.collector_ready[c, oldest] = 1 if exits else 0 if kind == MEMORY else -1
-        sm.collector_order[c, oldest] = order
-        sm.collector_chain[c, oldest] = sm.issued_chain[kind, oldest]
-        if kind == MEMORY:
-            sm.collector_row[c, oldest] = sm.issued_row[oldest]
-            sm.collector_load[c, oldest] = sm.issued_load[oldest]
-        sm.issued_slot[kind, oldest] = -1
-        sm.num_issued[kind] -= 1
-        sm.is_stuck = 0
-        return True
-    return False
-
-
-@compiled
-def _collect(state, index):  # type: ignore[no-untyped-def]
-    """One cycle of GPGPU-Sim's operand collectors: two steps of dispatch, reads, allocation.
-
-    A scheduler's collectors are tried in their order, so that under pressure a later one waits.
-    """
-    machine = state.pool.machine[0]
-    sm = state.sms[index]
-    now = machine.now
-    changed = False
-    later = NEVER
-    for _ in range(2):
-        for s in range(machine.num_schedulers):
-            for c in range(machine.collector_units):
-                if sm.collector_slot[c, s] < 0:
-                    continue
-                if sm.collector_ready[c, s] <= 0:
-                    sm.collector_ready[c, s] += 1
-                    changed = True
-                elif _dispatch(state, index, s, c):
-                    changed = True
-                elif sm.collector_kind[c, s] != MEMORY:
-                    later = now + 1
-        # Each of the ports takes the oldest of every kind in turn; one that finds no collector of
-        # its scheduler free blocks its kind.
-        moved = True
-        while moved:
-            moved = False
-            for place in range(4):
-                moved |= _allocate(state, index, _PORT_ORDER[place])
-            changed |= moved
-    sm.collect_from = now + 1 if changed else later
-
-
-@compiled
-def _enter_collectors(state, index, s, slot, warp, kind):  # type: ignore[no-untyped-def]
-    """Issue to the collectors' entry."""
-    machine = state.pool.machine[0]
-    sm = state.sms[index]
-    place = kind if kind == MEMORY else _unit_of(machine, kind)
-    sm.order += 1
-    sm.num_collecting += 1
-    sm.collect_from = 0
-    sm.issued_slot[place, s] = slot
-    sm.num_issued[place] += 1
-    sm.issued_order[place, s] = sm.order
-    sm.issued_chain[place, s] = warp.chain
-    sm.issued_kind[place, s] = kind
-    if kind == MEMORY:
-        row = state.work.rows[warp.row & machine.row_mask]
-        sm.issued_row[s] = warp.row
-        sm.issued_load[s] = _note_access(state, warp, row)
-    elif is_exit(warp):
-        sm.issued_chain[place, s] = -1
-        warp.exit_ready = NEVER
-    else:
-        warp.chains_ready[warp.chain] = NEVER
-        if kind == INT:
-            warp.int_ready = NEVER
-
-
-@compiled
 def _start_arithmetic(state, index, scheduler, warp, kind, now):  # type: ignore[no-untyped-def]
     """Send an instruction to its unit, and note when its result is there."""
     machine = state.pool.machine[0]
     sm = state.sms[index]
-    unit = _unit_of(machine, kind)
-    start = max(now + _AHEAD, sm.unit_free[unit, scheduler])
+    unit = unit_of(machine, kind)
+    start = max(now + AHEAD, sm.unit_free[unit, scheduler])
     sm.unit_free[unit, scheduler] = start + state.latencies[kind, 1]
-    done = start + state.latencies[kind, 0] + machine.result_cycles - _AHEAD
+    done = start + state.latencies[kind, 0] + machine.result_cycles - AHEAD
     if is_exit(warp):
-        warp.exit_ready = start + machine.result_cycles - _AHEAD + 1
+        warp.exit_ready = start + machine.result_cycles - AHEAD + 1
         return
     warp.chains_ready[warp.chain] = done
     if kind == INT:
@@ -251,7 +81,7 @@ def _start_memory(state, index, scheduler, slot, warp, now):  # type: ignore[no-
     sm.queue_time[at, scheduler] = now + machine.memory_cycles - 1
     sm.queue_row[at, scheduler] = warp.row
     sm.queue_count[scheduler] += 1
-    sm.queue_load[at, scheduler] = _note_access(state, warp, row)
+    sm.queue_load[at, scheduler] = note_access(state, warp, row)
 
 
 @small
@@ -260,10 +90,10 @@ def _has_room(state, index, scheduler, kind, now):  # type: ignore[no-untyped-de
     machine = state.pool.machine[0]
     sm = state.sms[index]
     if machine.collector_units > 0:
-        return sm.issued_slot[_unit_of(machine, kind), scheduler] < 0
+        return sm.issued_slot[unit_of(machine, kind), scheduler] < 0
     if kind == MEMORY:
         return sm.queue_count[scheduler] < machine.memory_queue
-    return sm.unit_free[_unit_of(machine, kind), scheduler] <= now + _AHEAD
+    return sm.unit_free[unit_of(machine, kind), scheduler] <= now + AHEAD
 
 
 @compiled
@@ -288,7 +118,7 @@ def _issue(state, index, scheduler):  # type: ignore[no-untyped-def]
         kind = 0
         while (sm.ready[kind] & bit) == 0:
             kind += 1
-        unit = _unit_of(machine, kind)
+        unit = unit_of(machine, kind)
         if issued > 0 and (
             (machine.different_units and unit == previous)
             or not _has_room(state, index, scheduler, kind, now)
@@ -296,7 +126,7 @@ def _issue(state, index, scheduler):  # type: ignore[no-untyped-def]
             break
         sm.ready[kind] &= ~bit
         if machine.collector_units > 0:
-            _enter_collectors(state, index, scheduler, slot, warp, kind)
+            enter_collectors(state, index, scheduler, slot, warp, kind)
         elif kind == MEMORY:
             _start_memory(state, index, scheduler, slot, warp, now)
         else:
@@ -415,7 +245,7 @@ def step_sm(state, index):  # type: ignore[no-untyped-def]
         has_moved |= sm.wheel[now & (WHEEL - 1)] != 0
         wake_timed(state, index)
     if sm.num_collecting > 0 and sm.collect_from <= now:
-        _collect(state, index)
+        collect(state, index)
         has_moved |= sm.collect_from <= now + 1
     issued = 0
     issuers = 0
