@@ -13,7 +13,8 @@ from experiments.tables import MISSING, Column, Table, show_value, three_digits
 DEMAND_NAMES = {"l1_bytes": "L1", "l2_bytes": "L2", "dram_bytes": "DRAM"}
 RATE_NAMES = {"l1_miss_rate": "L1", "l2_miss_rate": "L2"}
 #: Numbers of the central table that only a timed run has.
-TIME_NAMES = ("cycles", "time_ms")
+TIME_HEADINGS = {"cycles": "cycles (M)", "time_ms": "ms"}
+TIME_NAMES = tuple(TIME_HEADINGS)
 #: Why adaptive can ask more of a level, and why its miss rate can rise while its misses fall.
 EXTRA = (
     "Only adaptive reads a history in the sampling pass and writes one in the update pass, and the "
@@ -60,8 +61,11 @@ def quality_table(quality: pd.DataFrame, title: str, num_frames: int) -> Table:
 
 
 def demand_table(demand: pd.DataFrame, ratios: pd.DataFrame, title: str, size: str) -> Table:
-    """The central table: fixed, adaptive, and adaptive / fixed of all passes and of sampling."""
-    numbers = [*DEMAND_NAMES, *RATE_NAMES, *TIME_NAMES]
+    """The central table: fixed, adaptive, and adaptive / fixed of all passes and of sampling; times
+    where a GPU was timed.
+    """
+    times = TIME_NAMES if demand["cycles"].notna().any() else ()
+    numbers = [*DEMAND_NAMES, *RATE_NAMES, *times]
     of_frame = demand[demand["passes"] == "all"]
     by_key = ratios.set_index(["scene", "gpu", "passes"])
     rows = []
@@ -85,8 +89,7 @@ def demand_table(demand: pd.DataFrame, ratios: pd.DataFrame, title: str, size: s
         Column("dram_bytes", "DRAM (MB)", numeric=True),
         Column("l1_miss_rate", "L1 miss rate", numeric=True),
         Column("l2_miss_rate", "L2 miss rate", numeric=True),
-        Column("cycles", "cycles (M)", numeric=True),
-        Column("time_ms", "ms", numeric=True),
+        *(Column(name, TIME_HEADINGS[name], numeric=True) for name in times),
     )
     return Table(title, pd.DataFrame(rows), columns, tuple(findings(ratios, size)))
 

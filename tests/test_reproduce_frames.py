@@ -151,10 +151,16 @@ def test_the_generations_verdict_counts_where_it_holds():
          "l2_bytes": [0.5, 0.4, 9.0], "dram_bytes": [0.9, 0.9, 9.0], "l1_miss_rate": [1.0] * 3,
          "l2_miss_rate": [2.0] * 3, "cycles": [np.nan] * 3}
     )  # fmt: skip
-    found = {c.quantity.split(",")[0]: c for c in gpu_generations.judge(ratios)}
+    judged = gpu_generations.judge(ratios, ratios, "640x360")
+    found = {c.quantity.split(",")[0]: c for c in judged}
     assert found["L1 demand"].verdict == "lower in 1 of 2 views and GPUs"
     assert found["L1 demand"].ours == "0.200 to 1.100"
-    assert "cycles" not in found
+    assert not any("cycles" in name for name in found)
+    timed = ratios.assign(cycles=[0.4, 0.6, 9.0])
+    (cycles,) = (
+        c for c in gpu_generations.judge(ratios, timed, "640x360") if "cycles" in c.quantity
+    )
+    assert "640x360" in cycles.quantity and cycles.ours == "0.400 to 0.600"
 
 
 @pytest.mark.opencl
@@ -184,6 +190,7 @@ def test_a_run_that_goes_on_finds_its_cells_finished(module, tmp_path, monkeypat
         monkeypatch.setattr(module, "QUICK_FRAMES", 3)
     if module is gpu_generations:
         monkeypatch.setattr(module, "GPUS", {"rx-6900-xt": "Navi 21"})
+        monkeypatch.setattr(module, "QUICK_TIMED_SIZE", (16, 16))
     settings = Settings(True, tmp_path)
     first = module.EXPERIMENT.run(settings)
 
