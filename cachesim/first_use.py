@@ -4,6 +4,11 @@ something else meanwhile.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
+
+from numba import config
+
 from cachesim.simulate import simulate
 from traces.synthetic import pixel_pass, stream
 from traces.texture import Texture
@@ -20,6 +25,20 @@ def compile_loops(*, lane_address: bool = False, timing: bool = False) -> None:
         machine instead of the counting one, about 20 s.
     """
     trace = stream(8, 1) if lane_address else pixel_pass(Texture("t", "RGBA16F", 8, 8), "store")
-    # The clock's loops are the same for every machine.
-    for name in _PRESETS[:1] if timing else _PRESETS:
-        simulate(trace, name, threaded=False, timing=timing)
+    with _without_vectors() if timing else nullcontext():
+        # The clock's loops are the same for every machine.
+        for name in _PRESETS[:1] if timing else _PRESETS:
+            simulate(trace, name, threaded=False, timing=timing)
+
+
+@contextmanager
+def _without_vectors() -> Iterator[None]:
+    """The loop vectoriser off meanwhile: the clock has nothing for it, and compiles in an eighth
+    less time.
+    """
+    before = config.LOOP_VECTORIZE  # type: ignore[attr-defined]
+    config.LOOP_VECTORIZE = 0  # type: ignore[attr-defined]
+    try:
+        yield
+    finally:
+        config.LOOP_VECTORIZE = before  # type: ignore[attr-defined]
