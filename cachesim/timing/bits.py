@@ -27,6 +27,20 @@ def _trailing_zeros(typingctx: Any, mask: Any) -> Any:
     return types.int64(types.uint64), codegen
 
 
+@intrinsic
+def _population(typingctx: Any, mask: Any) -> Any:
+    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return builder.ctpop(arguments[0])
+
+    return types.int64(types.uint64), codegen
+
+
+@small
+def num_set(mask):  # type: ignore[no-untyped-def]
+    """How many bits are set."""
+    return _population(mask)  # type: ignore[call-arg]
+
+
 @small
 def lowest(mask):  # type: ignore[no-untyped-def]
     """Place of the lowest bit that is set; `mask` is not 0."""

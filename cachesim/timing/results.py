@@ -14,7 +14,7 @@ import pandas as pd
 #: Where an issue slot, the cycle of a scheduler, can go, and what it says when most go there.
 REASONS: dict[str, str] = {
     "issue": "the schedulers issued instructions",
-    "arithmetic": "every warp waited for an execution unit or its result",
+    "arithmetic": "most warps waited for an execution unit or its result",
     "l1_bandwidth": "memory instructions waited for the L1's ports, tags, banks or filters",
     "l1_reservation": "a miss found no MSHR, merge slot, line or queue entry and was tried again",
     "interconnect": "requests or replies queued in the interconnect",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from cachesim.compiled import compiled, small
-from cachesim.timing.bits import bit_at, lowest, without_lowest
+from cachesim.timing.bits import bit_at, lowest, num_set, without_lowest
 from cachesim.timing.collectors import collect, enter_collectors
 from cachesim.timing.pipe import book_sleep, step_pipe
 from cachesim.timing.records import (
@@ -209,14 +209,15 @@ def _next_event(state, index):  # type: ignore[no-untyped-def]
 
 @small
 def _find_stall(sm, mine, blocked):  # type: ignore[no-untyped-def]
-    """Why a scheduler whose warps are `mine` does not issue. blocked: 0, or why an access of the SM
-    did not leave its pipe.
+    """Why a scheduler whose warps are `mine` does not issue: what most of them wait for. blocked:
+    0, or why an access of the SM did not leave its pipe.
     """
-    if sm.resident & mine == 0:
+    resident = sm.resident & mine
+    if resident == 0:
         return R_IDLE
     if sm.ready[MEMORY] & mine:
         return blocked if blocked > 0 else R_L1_BANDWIDTH
-    if sm.resident & ~sm.blocked & mine:
+    if 2 * num_set(sm.blocked & mine) < num_set(resident):
         return R_ARITHMETIC
     return blocked if blocked > 0 else R_MEMORY
 
