@@ -104,11 +104,13 @@ def test_the_regions_are_where_the_light_is_steepest_and_most_even():
     scatters[:, :8] = False
     regions = adaptive_o1.find_regions(scalar, scatters)
     columns = {name: np.flatnonzero(mask.any(axis=0)) for name, mask in regions.items()}
-    assert abs(columns[adaptive_o1.EDGE] - 30).max() <= 2
-    assert abs(columns[adaptive_o1.FLAT] - 30).min() > 8
-    assert columns[adaptive_o1.FLAT].min() > 8, "the border of what scatters is no flat area"
-    y, x = adaptive_o1.pick_pixel(regions[adaptive_o1.EDGE])
-    assert regions[adaptive_o1.EDGE][y, x] and abs(y - 20) <= 2
+    assert abs(columns[adaptive_o1_results.EDGE] - 30).max() <= 2
+    assert abs(columns[adaptive_o1_results.FLAT] - 30).min() > 8
+    assert columns[adaptive_o1_results.FLAT].min() > 8, (
+        "the border of what scatters is no flat area"
+    )
+    y, x = adaptive_o1.pick_pixel(regions[adaptive_o1_results.EDGE])
+    assert regions[adaptive_o1_results.EDGE][y, x] and abs(y - 20) <= 2
 
 
 def test_a_global_guide_is_the_estimator_with_the_shown_picture_as_history():
@@ -129,14 +131,19 @@ def test_a_global_guide_is_the_estimator_with_the_shown_picture_as_history():
 
 def made_series(edge, flat, frames=40):
     """Constant counts but for one pixel of the edge, which takes two values in turn."""
-    columns = list(adaptive_o1.COLUMNS)
+    columns = list(adaptive_o1_results.COLUMNS)
     found = {}
-    for region, (count, low, high) in ((adaptive_o1.EDGE, edge), (adaptive_o1.FLAT, flat)):
+    for region, (count, low, high) in (
+        (adaptive_o1_results.EDGE, edge),
+        (adaptive_o1_results.FLAT, flat),
+    ):
         rows = np.zeros((frames, len(columns)))
         rows[:, columns.index("count")] = count
         rows[:, columns.index("pixel_count")] = np.where(np.arange(frames) % 2, low, high)
         rows[:, columns.index("step")] = high - low
-        rows[:, columns.index("estimated_error")] = 0.02 if region == adaptive_o1.EDGE else 0.01
+        rows[:, columns.index("estimated_error")] = (
+            0.02 if region == adaptive_o1_results.EDGE else 0.01
+        )
         found[region] = rows
     return found
 
@@ -162,10 +169,10 @@ def test_no_reading_of_the_gain_is_claimed_and_near_ones_are_told():
             "shown_error": shown, "count": 8,
         }  # fmt: skip
 
-    edge, flat = adaptive_o1.EDGE, adaptive_o1.FLAT
+    edge, flat = adaptive_o1_results.EDGE, adaptive_o1_results.FLAT
     guided = {
-        adaptive_o1.GUIDED: {edge: cell(11**0.5, 1.0), flat: cell(2**0.5, 1.0)},
-        adaptive_o1.UNGUIDED: {edge: cell(3.0, 1.0), flat: cell(3.0, 2.0)},
+        adaptive_o1_results.GUIDED: {edge: cell(11**0.5, 1.0), flat: cell(2**0.5, 1.0)},
+        adaptive_o1_results.UNGUIDED: {edge: cell(3.0, 1.0), flat: cell(3.0, 2.0)},
     }
     gains = adaptive_o1_results.read_gains(guided)
     assert gains["variance, each frame / accumulated"] == pytest.approx({edge: 11, flat: 2})

@@ -33,7 +33,7 @@ from kernels.opencl.icd import driver_libraries, user_vendors
 #: A CPU device for any x86-64 Linux; the `intel` extra of this project.
 INTEL_WHEELS = ("intel-opencl-rt", "intel-cmplr-lib-rt")
 INTEL_SIZE = "280 MB to download, 800 MB on disk"
-_ROOT = Path(__file__).resolve().parents[1]
+_ROOT = Path(__file__).resolve().parents[2]
 _PROBE_TIMEOUT_S = 120
 
 
