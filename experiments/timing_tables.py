@@ -109,9 +109,8 @@ def notes(timing: TimingResult, gpu: Gpu) -> tuple[str, ...]:
     total = timing.total
     name = REASON_NAMES[total.bottleneck]
     meaning = f"{name[0].upper()}{name[1:]}: {REASONS[total.bottleneck]}."
-    running = total.cycles - total.where.get("launch", 0)
-    if total.bottleneck not in ("issue", "launch") and running:
-        issued = total.where.get("issue", 0) / running
+    if total.bottleneck not in ("issue", "launch"):
+        issued = share_of_cycles(total, "issue")
         meaning += f" Instructions issued in {issued:.0%} of the schedulers' cycles."
     lines = [bottleneck_line(total), meaning]
     for part in timing.passes:
@@ -144,7 +143,11 @@ def bottleneck_line(part: PassTiming) -> str:
 
 def bottleneck_share(part: PassTiming) -> float:
     """The bottleneck's share of the cycles; the launch is left out unless it is the bottleneck."""
-    reason = part.bottleneck
+    return share_of_cycles(part, part.bottleneck)
+
+
+def share_of_cycles(part: PassTiming, reason: str) -> float:
+    """A reason's share of the cycles; the launch is left out unless it is the reason."""
     of = part.cycles if reason == "launch" else part.cycles - part.where.get("launch", 0)
     return part.where.get(reason, 0) / of if of else 0.0
 
