@@ -209,7 +209,9 @@ def held_in(clock: Clock) -> dict[str, int]:
         held[f"pipe.{field}"] = int(state.pipes[field].sum())
     for field in ("warp", "next_writeback", "next_global"):
         held[f"pipe.{field}"] = int((state.pipes[field] >= 0).sum())
-    for field in ("num_resident", "num_blocked", "num_timed", "num_collecting", "eject_count"):
+    for field in ("resident", "blocked"):
+        held[f"sm.{field}"] = int(np.count_nonzero(state.sms[field]))
+    for field in ("num_resident", "num_timed", "num_collecting", "eject_count"):
         held[f"sm.{field}"] = int(state.sms[field].sum())
     held["sm.queues"] = int(state.sms["queue_count"].sum())
     held["warps"] = int(state.warps["alive"].sum())

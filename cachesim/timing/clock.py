@@ -247,7 +247,7 @@ class Clock:
             held = held + channels[f"{part}_count"]
         if held.sum():
             found.append(f"dram {int(held.sum())} (channel {int(held.argmax())})")
-        blocked = int(state.sms["num_blocked"].sum())
+        blocked = sum(int(mask).bit_count() for mask in state.sms["blocked"])
         return f"cycle {self.cycles}, {blocked} warps wait; " + (
             "; ".join(found) or "all queues empty"
         )

@@ -200,7 +200,6 @@ SM = _in_lines(
     ("waits_for_room", "i4"),  # whether it sleeps until its port has room
     ("num_timed", "i4"),
     ("num_resident", "i4"),
-    ("num_blocked", "i4"),
     ("is_stuck", "i4"),  # whether nothing can issue until something changes
     ("num_collecting", "i4"),
     ("free_places", "i4"),

@@ -18,7 +18,6 @@ from cachesim.timing.records import MAX_LOADS, MAX_WARPS, MEMORY, NEVER, WAIT, W
 @small
 def _block(sm, warp, slot, until):  # type: ignore[no-untyped-def]
     warp.waits_for = until
-    sm.num_blocked += 1
     sm.blocked |= bit_at(slot)
 
 
@@ -160,7 +159,6 @@ def _unblock(state, warp_index):  # type: ignore[no-untyped-def]
     index = warp_index // MAX_WARPS
     slot = warp_index % MAX_WARPS
     sm = state.sms[index]
-    sm.num_blocked -= 1
     sm.blocked &= ~bit_at(slot)
     schedule(state, index, slot, state.pool.machine[0].now)
 
