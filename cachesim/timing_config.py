@@ -38,6 +38,7 @@ Scheduler = Literal["gto", "lrr"]
 Allocation = Literal["on-miss", "on-fill", "streaming"]
 Queueing = Literal["input-fifo", "output-queued"]
 DramScheduler = Literal["fr-fcfs", "fifo"]
+CommandBus = Literal["single", "dual", "bank-order"]
 
 
 class _Timing(BaseModel):
@@ -60,6 +61,8 @@ class SmTiming(_Timing):
     memory_queue: memory instructions of one scheduler that may wait for the load/store unit.
     collector_units: operand collectors of a scheduler; waiting memory instructions hold them, and
         arithmetic stops when all are held. 0 = they are not modelled.
+    register_banks: of a scheduler's registers. A bank gives its collectors one operand a step, two
+        steps a cycle; 0 = operands never clash.
     texture_quads_per_cycle: bilinear quads of up to 64-bit texels that the SM's texture units
         filter in a cycle; 128-bit texels take four times as long. 0 = no limit.
     launch_cycles: added before each kernel. cta_launch_cycles: before each CTA.
@@ -81,7 +84,8 @@ class SmTiming(_Timing):
     result_cycles: Annotated[int, BeforeValidator(_whole), Field(ge=0, le=64)]
     memory_cycles: Annotated[int, BeforeValidator(_whole), Field(gt=0, le=64)]
     memory_queue: Annotated[int, BeforeValidator(_whole), Field(gt=0, le=64)]
-    collector_units: Annotated[int, BeforeValidator(_whole), Field(ge=0, le=64)]
+    collector_units: Annotated[int, BeforeValidator(_whole), Field(ge=0, le=8)]
+    register_banks: Annotated[int, BeforeValidator(_whole), Field(ge=0, le=8)]
     texture_quads_per_cycle: Limit
     launch_cycles: Cycles
     cta_launch_cycles: Cycles
@@ -168,8 +172,10 @@ class Icnt(_Timing):
 
     queueing: "input-fifo" is a crossbar whose inputs are FIFOs, so that a blocked head blocks what
         is behind it; "output-queued" has no such blocking.
-    inputs_match_again: an input that sent a packet may send its next one to a later output in the
-        same cycle (GPGPU-Sim's built-in crossbar).
+    router_steps: at "input-fifo", steps a cycle of a router that first gives an output to one of
+        the inputs that ask for it and moves that one's packet in a later step (BookSim, with its
+        internal speed-up). 0 = a packet moves in one step, and its input may then send the next
+        one to a later output in the same cycle (GPGPU-Sim's built-in crossbar).
     request_latency_cycles, reply_latency_cycles: on top of one cycle's transfer.
     flit_bytes: an output moves so many in a cycle; at "input-fifo" a packet holds it for whole
         cycles. header_bytes: of each packet.
@@ -178,7 +184,7 @@ class Icnt(_Timing):
     """
 
     queueing: Queueing
-    inputs_match_again: bool
+    router_steps: Annotated[int, BeforeValidator(_whole), Field(ge=0, le=8)]
     request_latency_cycles: Annotated[int, BeforeValidator(_whole), Field(ge=0, le=4096)]
     reply_latency_cycles: Annotated[int, BeforeValidator(_whole), Field(ge=0, le=4096)]
     flit_bytes: PortBytes
@@ -196,7 +202,9 @@ class DramTiming(_Timing):
         cycle. CCD ... RTPL: command cycles, under their names in the device's data sheet.
     fixed_latency_cycles: core cycles before a request reaches the controller.
     queue: requests that the scheduler sees. return_queue: entries.
-    dual_command_bus: a row and a column command may issue in one cycle.
+    command_bus: "single": one row or column command a cycle; "dual": one of each; "bank-order":
+        GPGPU-Sim's single bus, which tries the banks in turn, so that a bank's row command does not
+        keep a later bank from its column command.
     row_bytes: of one bank. num_bank_groups: consecutive banks lie in different groups.
     address_map: GPGPU-Sim's 64-character map of address bits (facts sheet 3.4).
     """
@@ -223,7 +231,7 @@ class DramTiming(_Timing):
     scheduler: DramScheduler
     queue: Entries
     return_queue: Entries
-    dual_command_bus: bool
+    command_bus: CommandBus
     address_map: str
 
     @model_validator(mode="after")

@@ -46,6 +46,7 @@ SMALL = """
 -gpgpu_pipeline_widths 2,0,2,2,4,2,0,2,2,2,4
 -gpgpu_enable_specialized_operand_collector 0
 -gpgpu_operand_collector_num_units_gen 6
+-gpgpu_num_reg_banks 12
 -gpgpu_cache:dl1 S:8:128:16,F:E:f:N:X,A:64:4,12:0,64
 -gpgpu_tex_cache:l1 N:4:64:8,L:R:m:N:L,F:32:6,24:3
 -gpgpu_gmem_skip_L1D 1
@@ -134,6 +135,7 @@ EXPECTED = {
     "sm_timing.control_initiation_cycles": 7,
     "sm_timing.int_on_fp32": False,
     "sm_timing.collector_units": 3,
+    "sm_timing.register_banks": 6,
     "sm_timing.memory_queue": 2 + 3 + 1,
     "sm_timing.launch_cycles": 700,
     "sm_timing.cta_launch_cycles": 30,
@@ -152,7 +154,7 @@ EXPECTED = {
     "l1_texture_timing.reorder_buffer": 24,
     "l1_texture_timing.result_fifo": 3,
     "icnt.queueing": "input-fifo",
-    "icnt.inputs_match_again": True,
+    "icnt.router_steps": 0,
     "icnt.request_latency_cycles": 0,
     "icnt.reply_latency_cycles": 0,
     "icnt.flit_bytes": 80,
@@ -195,7 +197,7 @@ EXPECTED = {
     "dram_timing.scheduler": "fifo",
     "dram_timing.queue": 21,
     "dram_timing.return_queue": 1 << 16,  # 0: without limit
-    "dram_timing.dual_command_bus": True,
+    "dram_timing.command_bus": "dual",
 }
 
 
@@ -357,7 +359,7 @@ def test_booksims_file_is_read_beside_the_config(tmp_path: Path) -> None:
         // flits of half a packet
         flit_size = 20; topology = fly; k = 52; n = 1;
         num_vcs = 2; vc_buf_size = 8; input_buffer_size = 0; // 0: BookSim's 9
-        ejection_buffer_size = 32; packet_size = {{1,2},{3}};
+        boundary_buffer_size = 32; packet_size = {{1,2},{3}}; internal_speedup = 2.0;
         """,
         "net.icnt",
     )
@@ -366,13 +368,21 @@ def test_booksims_file_is_read_beside_the_config(tmp_path: Path) -> None:
         "flit_bytes": 20,
         "queueing": "input-fifo",
     }
-    assert value(imported, "icnt.inputs_match_again") is False
+    assert value(imported, "icnt.router_steps") == 2
+    assert value(missing, "icnt.router_steps") == 1
     assert value(imported, "icnt.input_packets") == (9 + 2 * 8) // 2
-    assert value(imported, "icnt.output_packets") == 32 // 2
+    assert value(imported, "icnt.output_packets") == (2 * 8 + 32) // 2
     assert value(imported, "icnt.request_latency_cycles") == 5
     reasons = group_remarks(missing.differing)
     assert reasons["there is no such file beside the config"] == ["-inter_config_file net.icnt"]
     assert "there is no such file beside the config" not in group_remarks(imported.differing)
+
+
+@pytest.mark.parametrize("speedup", ["1.5", "0", "9", "fast"])
+def test_a_router_has_whole_steps(tmp_path: Path, speedup: str) -> None:
+    write(tmp_path / "TINY", f"k = 6;\ninternal_speedup = {speedup};", "net.icnt")
+    with pytest.raises(InputError, match=r"net\.icnt:2: .*internal_speedup.*from 1 to 8"):
+        small(tmp_path, "-network_mode 1\n-inter_config_file net.icnt")
 
 
 def test_another_topology_is_told_of(tmp_path: Path) -> None:

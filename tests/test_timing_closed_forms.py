@@ -265,7 +265,7 @@ def test_a_stream_from_memory_reaches_the_bus(data_rate: int, ccd: int) -> None:
     gpu = one_sm(
         "sm.count=4", "l1.bypass_loads=true", f"dram_timing.data_rate={data_rate}",
         f"dram_timing.ccd={ccd}", f"dram_timing.ccdl={ccd}", "dram_timing.rrd=1",
-        "dram_timing.dual_command_bus=true",
+        "dram_timing.command_bus=dual",
     )  # fmt: skip
     assert gpu.dram_timing is not None
     rate = bytes_per_cycle(gpu, 64, 1 << 30, "global", loads=16, warm=False)
@@ -281,11 +281,8 @@ def test_a_stream_from_memory_reaches_the_bus(data_rate: int, ccd: int) -> None:
     ],
 )
 def test_a_stream_attains_what_accel_sim_attained(
-    config: str, name: str, overrides: list[str], request: pytest.FixtureRequest
+    config: str, name: str, overrides: list[str]
 ) -> None:
-    if config == "SM6_TITANX_L1":
-        reason = "8 % above: row 6 of cachesim/timing/DEVIATIONS.md"
-        request.applymarker(pytest.mark.xfail(strict=True, reason=reason))
     table = pd.read_csv(RESULTS).set_index(["config", "trace"])
     gpu = presets.load(name, overrides)
     assert gpu.sm_timing is not None
@@ -387,7 +384,7 @@ _NEVER_BINDS = (
 
 @pytest.mark.parametrize("binds", _BOUND)
 def test_doubling_what_binds_helps_and_doubling_the_rest_does_not(binds: str) -> None:
-    base = ("sm.count=2", "l1.bypass_loads=true", "dram_timing.dual_command_bus=true",
+    base = ("sm.count=2", "l1.bypass_loads=true", "dram_timing.command_bus=dual",
             "dram_timing.rrd=1", *_BOUND[binds])  # fmt: skip
     footprint = 1 << 30 if binds.startswith("dram") else 16 << 10
     path = "readonly" if binds.startswith("l1") else "global"

@@ -69,7 +69,11 @@ def dram_timing(options: Options) -> dict[str, Sourced]:
         ),
         "queue": _queue(options, "-gpgpu_frfcfs_dram_sched_queue_size"),
         "return_queue": _queue(options, "-gpgpu_dram_return_queue_size"),
-        "dual_command_bus": options.sourced(options.flag(dual), dual),
+        "command_bus": options.sourced(
+            "dual" if options.flag(dual) else "bank-order",
+            dual,
+            "" if options.flag(dual) else ": dram.cc tries the banks in turn, a row command first",
+        ),
         "address_map": options.sourced(f"dramid@{first_bit};{letters}", mapping),
     }
     return {f"dram_timing.{field}": entry for field, entry in fields.items()}

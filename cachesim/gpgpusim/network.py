@@ -15,7 +15,7 @@ HEADER_BYTES = 8
 BOOKSIM_CYCLES = 5
 _FILE = "-inter_config_file"
 _MODES = {
-    "1": "BookSim: an input sends one packet in a cycle",
+    "1": "BookSim: an input sends one packet in a cycle at most",
     "2": "the built-in crossbar: an input may send to one output after the other in a cycle",
 }
 #: BookSim's own values where a file has none; 0 takes the value of _FALLBACK.
@@ -25,6 +25,8 @@ _BOOKSIM_DEFAULTS = {
     "vc_buf_size": 8,
     "input_buffer_size": 9,
     "ejection_buffer_size": 0,
+    "boundary_buffer_size": 16,
+    "internal_speedup": 1,
 }
 
 
@@ -41,9 +43,6 @@ def icnt(options: Options) -> Fields:
     response = "-gpgpu_n_ldst_response_buffer_size"
     fields = {
         "queueing": options.sourced("input-fifo", "-network_mode", f" {mode}: inputs are FIFOs"),
-        "inputs_match_again": options.sourced(
-            mode == "2", "-network_mode", f" {mode}, {_MODES[mode]}"
-        ),
         **own,
         "header_bytes": Sourced(HEADER_BYTES, "GPGPU-Sim's READ_PACKET_SIZE", "S"),
         "ejection_packets": options.sourced(options.number(ejection, 1, 1 << 16), ejection),
@@ -93,6 +92,7 @@ def _crossbar(options: Options) -> Fields:
             "D",
         )
     return {
+        "router_steps": options.sourced(0, "-network_mode", f" 2, {_MODES['2']}"),
         "request_latency_cycles": no_delay,
         "reply_latency_cycles": no_delay,
         "flit_bytes": flit_entry,
@@ -116,7 +116,7 @@ def _booksim(options: Options) -> Fields:
     origin = f"{label(options.setting(_FILE))} {name}"
     flits = -(-(HEADER_BYTES + SECTOR_BYTES) // number["flit_size"])
     into = number["input_buffer_size"] + number["num_vcs"] * number["vc_buf_size"]
-    out = number["ejection_buffer_size"] or number["num_vcs"] * number["vc_buf_size"]
+    out = number["num_vcs"] * number["vc_buf_size"] + number["boundary_buffer_size"]
     packets = f", {flits} flit{'s' * (flits > 1)} to a packet"
 
     def entry(value: int, source: str, grade: str) -> Sourced:
@@ -126,6 +126,12 @@ def _booksim(options: Options) -> Fields:
 
     delay = Sourced(BOOKSIM_CYCLES, "counted over the stages of BookSim's router", "D")
     return {
+        "router_steps": entry(
+            number["internal_speedup"],
+            f"internal_speedup {number['internal_speedup']}: an output is given in one step, its "
+            "packet moves in the next",
+            "S",
+        ),
         "request_latency_cycles": delay,
         "reply_latency_cycles": delay,
         "flit_bytes": entry(number["flit_size"], "flit_size", "S"),
@@ -137,7 +143,8 @@ def _booksim(options: Options) -> Fields:
         ),
         "output_packets": entry(
             max(1, out // flits),
-            f"ejection_buffer_size {number['ejection_buffer_size']}{packets}",
+            f"vc_buf_size {number['vc_buf_size']} x num_vcs {number['num_vcs']} of credit + "
+            f"boundary_buffer_size {number['boundary_buffer_size']}{packets}",
             "D",
         ),
     }
@@ -155,8 +162,18 @@ def _network_number(file: dict[str, Setting] | None, key: str) -> int:
     setting = (file or {}).get(key)
     if setting is None:
         return _BOOKSIM_DEFAULTS[key]
-    least = 1 if key in ("flit_size", "num_vcs", "vc_buf_size") else 0
+    least = 1 if key in ("flit_size", "num_vcs", "vc_buf_size", "internal_speedup") else 0
+    if key == "internal_speedup":
+        return _speedup(setting)
     if not (setting.text.isdecimal() and len(setting.text) < 7 and int(setting.text) >= least):
         raise setting.refuse(f"allowed are whole numbers from {least}")
     # BookSim takes 0 as "my default".
     return int(setting.text) or _BOOKSIM_DEFAULTS[key]
+
+
+def _speedup(setting: Setting) -> int:
+    """Steps of the router in a cycle: BookSim's file has a decimal, of which we take whole ones."""
+    whole, _, fraction = setting.text.partition(".")
+    if not (whole.isdecimal() and len(whole) == 1 and 1 <= int(whole) <= 8) or fraction.strip("0"):
+        raise setting.refuse("allowed are whole numbers from 1 to 8")
+    return int(whole)

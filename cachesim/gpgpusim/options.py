@@ -45,6 +45,7 @@ DEFAULTS: dict[str, str | None] = {
     "-gpgpu_num_sfu_units": "1",
     "-gpgpu_pipeline_widths": "1,1,1,1,1,1,1,1,1,1,1,1,1",
     "-gpgpu_enable_specialized_operand_collector": "1",
+    "-gpgpu_num_reg_banks": "8",
     "-gpgpu_operand_collector_num_units_gen": "0",
     "-gpgpu_operand_collector_num_units_mem": "2",
     "-trace_opcode_latency_initiation_int": "4,1",
@@ -126,7 +127,7 @@ _IGNORED = {
     r"gpgpu_cache:dl1Pref|gpgpu_shmem_size_?(Pref|Def)": "kernels ask for no other split",
     r"gpgpu_(smem|shmem|sharedmem)": "no shared memory is accessed",
     r"gpgpu_(cache:il1|const_cache|inst_)": "instructions and constants always hit",
-    r"gpgpu_(num_reg_banks|reg_|opndcoll|operand)": "register banks do not conflict",
+    r"gpgpu_(reg_|opndcoll|operand)": "operands are read in two steps a cycle",
     r"gpgpu_(compute_cap|occupancy|stack|heap|runtime_(sync|pend)|ignore_res|max_conc|cdp|"
     r"registers_per|num_cta_bar|concurrent)": "limits of software, not of the memory system",
     r"gpgpu_ptx|save_|keep|ptx_": "the functional simulator",

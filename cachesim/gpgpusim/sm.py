@@ -41,6 +41,7 @@ def sm_timing(options: Options) -> Fields:
         "memory_cycles": Sourced(4, "counted over the stages of GPGPU-Sim's pipeline", "D"),
         "memory_queue": memory_queue,
         "collector_units": collector_units,
+        "register_banks": _register_banks(options, num_schedulers),
         "texture_quads_per_cycle": Sourced(0, "GPGPU-Sim has no limit of filtering", "S"),
         "launch_cycles": options.sourced(options.number(launch), launch),
         "cta_launch_cycles": options.sourced(options.number(cta_launch), cta_launch),
@@ -108,6 +109,17 @@ def _control_unit(options: Options) -> Fields:
         field: Sourced(entry.value, f"{entry.source}: branches take the integer unit", "D")
         for field, entry in fields.items()
     }
+
+
+def _register_banks(options: Options, num_schedulers: int) -> Sourced:
+    """Register banks of one scheduler: all of them where the sub-core model is off."""
+    option = "-gpgpu_num_reg_banks"
+    banks = options.number(option, 1, 64)
+    return Sourced(
+        min(8, max(1, banks // num_schedulers)),
+        f"{options.source(option)} {banks} over {num_schedulers} schedulers",
+        "D",
+    )
 
 
 def _collectors(options: Options, num_schedulers: int) -> tuple[Sourced, Sourced]:

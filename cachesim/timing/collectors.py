@@ -1,99 +1,150 @@
 """GPGPU-Sim's operand collectors of one SM: issued instructions wait here for their operands, then
 for their unit.
+
+issued, one of each unit and scheduler ──► collector: reads its register banks ──► unit
+
+A bank gives one operand a step, and none in the first step of a cycle in which loaded data enters.
+Registers are those of `traces.lane_address`: loads of a group fill R8, R9, … in their order, an
+instruction that takes a load's data adds it to R28, R29 or R30 in turn, addresses are in R2, a
+store's data in R28.
 """
 
 from __future__ import annotations
 
-from cachesim.compiled import compiled
+import numpy as np
+
+from cachesim.compiled import compiled, small
+from cachesim.stream import STORE
+from cachesim.timing.bits import bit_at, lowest, without_lowest
 from cachesim.timing.records import (
+    CONTROL,
     FP32,
     INT,
+    MAX_COLLECTORS,
     MAX_WARPS,
     MEMORY,
+    MAX_REGISTER_BANKS,
     NEVER,
     SFU,
 )
-from cachesim.timing.units import AHEAD, note_access, unit_of
+from cachesim.timing.units import (
+    ADDRESS,
+    AHEAD,
+    LOADED,
+    SUM,
+    note_access,
+    registers_written,
+    unit_of,
+)
 from cachesim.timing.warp import is_exit, schedule
 
-#: The order in which a port looks for instructions.
-_PORT_ORDER = (FP32, SFU, MEMORY, INT)
+U64 = np.uint64
+_PLACES = U64((1 << MAX_COLLECTORS) - 1)
 
 
-@compiled
-def _dispatch(state, index, s, c):  # type: ignore[no-untyped-def]
-    """Move a collected instruction to its unit, if that has room. Returns whether it did."""
+@small
+def _to_load_store(sm, place):  # type: ignore[no-untyped-def]
+    """Hand an access to the load/store unit's queue, which is empty."""
+    one = sm.collector[place]
+    s = place // MAX_COLLECTORS
+    sm.queue_head[s] = 0
+    sm.queue_count[s] = 1
+    sm.queue_warp[0, s] = one.slot
+    # The load/store unit takes the oldest of those that are there.
+    sm.queue_time[0, s] = one.order
+    sm.queue_row[0, s] = one.row
+    sm.queue_load[0, s] = one.load
+
+
+@small
+def _to_unit(state, index, place):  # type: ignore[no-untyped-def]
+    """Start an arithmetic instruction, if its unit has room. Returns whether it has."""
     machine = state.pool.machine[0]
     sm = state.sms[index]
-    now = machine.now
-    kind = sm.collector_kind[c, s]
-    if kind == MEMORY:
-        if sm.queue_count[s] > 0:
-            return False
-        sm.queue_head[s] = 0
-        sm.queue_count[s] = 1
-        sm.queue_warp[0, s] = sm.collector_slot[c, s]
-        # The load/store unit takes the oldest of those that are there.
-        sm.queue_time[0, s] = sm.collector_order[c, s]
-        sm.queue_row[0, s] = sm.collector_row[c, s]
-        sm.queue_load[0, s] = sm.collector_load[c, s]
+    one = sm.collector[place]
+    s = place // MAX_COLLECTORS
+    kind = one.kind
+    unit = unit_of(machine, kind)
+    # One instruction may wait between collector and unit.
+    if sm.unit_free[unit, s] - state.latencies[kind, 1] > machine.now:
+        return False
+    warp = state.warps[index * MAX_WARPS + one.slot]
+    start = max(machine.now + 1, sm.unit_free[unit, s])
+    if one.chain < 0:
+        sm.unit_free[unit, s] = start + 1
+        warp.exit_ready = start + machine.result_cycles - AHEAD + 1
     else:
-        unit = unit_of(machine, kind)
-        # One instruction may wait between collector and unit.
-        if sm.unit_free[unit, s] - state.latencies[kind, 1] > now:
-            return False
-        slot = sm.collector_slot[c, s]
-        warp = state.warps[index * MAX_WARPS + slot]
-        is_last = sm.collector_chain[c, s] < 0
-        start = max(now + 1, sm.unit_free[unit, s])
-        sm.unit_free[unit, s] = start + (1 if is_last else state.latencies[kind, 1])
+        sm.unit_free[unit, s] = start + state.latencies[kind, 1]
         done = start + state.latencies[kind, 0] + machine.result_cycles - AHEAD
-        if is_last:
-            warp.exit_ready = start + machine.result_cycles - AHEAD + 1
-        else:
-            warp.chains_ready[sm.collector_chain[c, s]] = done
+        warp.chains_ready[one.chain] = done
         if kind == INT:
             warp.int_ready = done
-        if warp.waits_chain >= 0:
-            warp.waits_chain = -1
-            schedule(state, index, slot, now + 1)
-    sm.collector_slot[c, s] = -1
-    sm.num_collecting -= 1
+    if warp.waits_chain >= 0:
+        warp.waits_chain = -1
+        schedule(state, index, one.slot, machine.now + 1)
     return True
 
 
-@compiled
-def _allocate(state, index, kind):  # type: ignore[no-untyped-def]
-    """Give the oldest issued instruction of a kind a collector of its scheduler, if one is free."""
-    machine = state.pool.machine[0]
-    sm = state.sms[index]
-    if sm.num_issued[kind] == 0:
+@small
+def _read_operands(sm, num_schedulers, written):  # type: ignore[no-untyped-def]
+    """Each bank that is not written gives one operand to the collector that has asked first."""
+    for s in range(num_schedulers):
+        left = (sm.reading >> U64(s * MAX_COLLECTORS)) & _PLACES
+        free = ~np.int64(written >> U64(s * MAX_REGISTER_BANKS))
+        while left != 0:
+            place = s * MAX_COLLECTORS + lowest(left)
+            rest = without_lowest(left)
+            while rest != 0:
+                other = s * MAX_COLLECTORS + lowest(rest)
+                rest = without_lowest(rest)
+                if sm.collector[other].since < sm.collector[place].since:
+                    place = other
+            left &= ~bit_at(place - s * MAX_COLLECTORS)
+            one = sm.collector[place]
+            taken = one.banks & free
+            free &= ~taken
+            # The second operand of a bank waits for the next step.
+            one.banks = (one.banks & ~taken) | (one.again & taken)
+            one.again &= ~taken
+            if one.banks == 0:
+                sm.reading &= ~bit_at(place)
+
+
+@small
+def _allocate(sm, unit, units_mask):  # type: ignore[no-untyped-def]
+    """Give the oldest issued instruction of a unit a collector of its scheduler. Returns whether
+    one is free; if not, it blocks the younger ones of other schedulers.
+    """
+    turn = sm.turn[unit]
+    if turn == 0:
         return False
-    oldest, order = -1, NEVER
-    for s in range(machine.num_schedulers):
-        if sm.issued_slot[kind, s] >= 0 and sm.issued_order[kind, s] < order:
-            oldest, order = s, sm.issued_order[kind, s]
-    if oldest < 0:
+    s = np.int64(turn & 15) - 1
+    free = ~(sm.collecting >> U64(s * MAX_COLLECTORS)) & units_mask
+    if free == 0:
         return False
-    for c in range(machine.collector_units):
-        if sm.collector_slot[c, oldest] >= 0:
-            continue
-        sm.collector_slot[c, oldest] = sm.issued_slot[kind, oldest]
-        sm.collector_kind[c, oldest] = sm.issued_kind[kind, oldest]
-        # One operand is read a step: arithmetic has two, a memory instruction its address, an exit
-        # none.
-        exits = sm.issued_chain[kind, oldest] < 0
-        sm.collector_ready[c, oldest] = 1 if exits else 0 if kind == MEMORY else -1
-        sm.collector_order[c, oldest] = order
-        sm.collector_chain[c, oldest] = sm.issued_chain[kind, oldest]
-        if kind == MEMORY:
-            sm.collector_row[c, oldest] = sm.issued_row[oldest]
-            sm.collector_load[c, oldest] = sm.issued_load[oldest]
-        sm.issued_slot[kind, oldest] = -1
-        sm.num_issued[kind] -= 1
-        sm.is_stuck = 0
-        return True
-    return False
+    place = s * MAX_COLLECTORS + lowest(free)
+    source, one = sm.issued[unit, s], sm.collector[place]
+    sm.order += 1
+    one.since = sm.order
+    one.order = source.order
+    one.slot = source.slot
+    one.kind = source.kind
+    one.chain = source.chain
+    one.banks = source.banks
+    one.again = source.again
+    bit = bit_at(place)
+    sm.collecting |= bit
+    sm.accesses &= ~bit
+    if source.banks != 0:
+        sm.reading |= bit
+    if unit == MEMORY:
+        one.row = source.row
+        one.load = source.load
+        sm.accesses |= bit
+    sm.turn[unit] = turn >> 4
+    sm.waiting[unit] &= ~(1 << s)
+    sm.is_stuck = 0
+    return True
 
 
 @compiled
@@ -104,30 +155,50 @@ def collect(state, index):  # type: ignore[no-untyped-def]
     """
     machine = state.pool.machine[0]
     sm = state.sms[index]
-    now = machine.now
+    units_mask = bit_at(machine.collector_units) - U64(1)
     changed = False
     later = NEVER
-    for _ in range(2):
-        for s in range(machine.num_schedulers):
-            for c in range(machine.collector_units):
-                if sm.collector_slot[c, s] < 0:
+    for step in range(2):
+        left = sm.collecting & ~sm.reading
+        while left != 0:
+            place = lowest(left)
+            left = without_lowest(left)
+            if sm.accesses & bit_at(place):
+                if sm.queue_count[place // MAX_COLLECTORS] > 0:
                     continue
-                if sm.collector_ready[c, s] <= 0:
-                    sm.collector_ready[c, s] += 1
-                    changed = True
-                elif _dispatch(state, index, s, c):
-                    changed = True
-                elif sm.collector_kind[c, s] != MEMORY:
-                    later = now + 1
-        # Each of the ports takes the oldest of every kind in turn; one that finds no collector of
-        # its scheduler free blocks its kind.
+                _to_load_store(sm, place)
+            elif not _to_unit(state, index, place):
+                later = machine.now + 1
+                continue
+            sm.collecting &= ~bit_at(place)
+            sm.num_collecting -= 1
+            changed = True
+        if sm.reading != 0:
+            # Loaded data is written in the first step.
+            written = registers_written(sm, machine.now) if step == 0 else U64(0)
+            _read_operands(sm, machine.num_schedulers, written)
+            changed = True
+        # Each of the ports takes the oldest of every unit in turn.
         moved = True
         while moved:
-            moved = False
-            for place in range(4):
-                moved |= _allocate(state, index, _PORT_ORDER[place])
+            moved = _allocate(sm, FP32, units_mask)
+            moved |= _allocate(sm, SFU, units_mask)
+            moved |= _allocate(sm, MEMORY, units_mask)
+            moved |= _allocate(sm, INT, units_mask)
             changed |= moved
-    sm.collect_from = now + 1 if changed else later
+    sm.collect_from = machine.now + 1 if changed else later
+
+
+@small
+def _note_banks(one, machine, operation, chain):  # type: ignore[no-untyped-def]
+    """The banks of an arithmetic instruction's operands."""
+    total = machine.register_banks
+    one.banks = 1 << ((SUM + chain) % total)
+    one.again = 0
+    if operation.load >= 0:
+        loaded = 1 << ((LOADED + operation.load) % total)
+        one.again = one.banks & loaded
+        one.banks |= loaded
 
 
 @compiled
@@ -135,23 +206,38 @@ def enter_collectors(state, index, s, slot, warp, kind):  # type: ignore[no-unty
     """Issue to the collectors' entry."""
     machine = state.pool.machine[0]
     sm = state.sms[index]
-    place = kind if kind == MEMORY else unit_of(machine, kind)
+    unit = kind if kind == MEMORY else unit_of(machine, kind)
     sm.order += 1
     sm.num_collecting += 1
     sm.collect_from = 0
-    sm.issued_slot[place, s] = slot
-    sm.num_issued[place] += 1
-    sm.issued_order[place, s] = sm.order
-    sm.issued_chain[place, s] = warp.chain
-    sm.issued_kind[place, s] = kind
+    ahead = 0
+    while sm.turn[unit] >> (4 * ahead) != 0:
+        ahead += 1
+    sm.turn[unit] |= (s + 1) << (4 * ahead)
+    sm.waiting[unit] |= 1 << s
+    one = sm.issued[unit, s]
+    one.order = sm.order
+    one.slot = slot
+    one.kind = kind
+    one.chain = warp.chain
+    one.banks = 0
+    one.again = 0
     if kind == MEMORY:
         row = state.work.rows[warp.row & machine.row_mask]
-        sm.issued_row[s] = warp.row
-        sm.issued_load[s] = note_access(state, warp, row)
+        one.row = warp.row
+        one.load = note_access(state, warp, row)
+        if machine.register_banks > 0:
+            one.banks = 1 << (ADDRESS % machine.register_banks)
+            if state.work.instructions[row.code].operation == STORE:
+                data = 1 << (SUM % machine.register_banks)
+                one.again = one.banks & data
+                one.banks |= data
     elif is_exit(warp):
-        sm.issued_chain[place, s] = -1
+        one.chain = -1
         warp.exit_ready = NEVER
     else:
+        if machine.register_banks > 0 and kind != CONTROL:
+            _note_banks(one, machine, state.work.operations[warp.operation], warp.chain)
         warp.chains_ready[warp.chain] = NEVER
         if kind == INT:
             warp.int_ready = NEVER

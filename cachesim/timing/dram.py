@@ -1,7 +1,8 @@
 """Memory channels: a fixed delay, then first-ready first-come first-served over banks and rows.
 
 The rules are those of facts sheet sections 3.3 to 3.5: open pages; one row or one column command a
-command cycle, both with a dual bus; credits bound what a slice may have in flight.
+command cycle, both with a dual bus, and with GPGPU-Sim's single one if their banks come in that
+order; credits bound what a slice may have in flight.
 """
 
 from __future__ import annotations
@@ -165,103 +166,137 @@ def _serve_bank(state, index):  # type: ignore[no-untyped-def]
     return False
 
 
+@small
+def _column_time(channel, bank, group):  # type: ignore[no-untyped-def]
+    """The tick from which a bank's open row may be read or written."""
+    if bank.write:
+        return max(channel.ccd, group.ccdl, bank.rcdwr, channel.rtw)
+    return max(channel.ccd, group.ccdl, bank.rcd, channel.wtr)
+
+
 @compiled
-def _column_command(state, index):  # type: ignore[no-untyped-def]
-    """Issue a read or write burst to the first bank that may."""
+def _issue_column(state, index, b):  # type: ignore[no-untyped-def]
+    """Read or write a burst of a bank's open row."""
+    machine = state.pool.machine[0]
+    memory = state.memory
+    channel = memory.channels[index]
+    bank = memory.banks[index * MAX_DRAM_BANKS + b]
+    group = memory.groups[index * MAX_DRAM_BANKS + (b & machine.group_mask)]
+    tick = machine.tick
+    if bank.write:
+        channel.is_writing = 1
+        channel.wtr = tick + machine.wtr
+        bank.wtp = tick + machine.wtp
+        delay = machine.wl
+        machine.dram_writes += 1
+    else:
+        channel.is_writing = 0
+        channel.rtw = tick + machine.rtw
+        bank.rtp = tick + machine.rtpl
+        group.rtpl = tick + machine.rtpl
+        delay = machine.cl
+        machine.dram_reads += 1
+    channel.ccd = tick + machine.ccd
+    group.ccdl = tick + machine.ccdl
+    room = memory.data_ring.shape[1] - 1
+    at = (channel.data_head + channel.data_count) & room
+    memory.data_ring[index, at] = bank.serving
+    memory.data_time[index, at] = tick + delay
+    channel.data_count += 1
+    bank.left -= 1
+    if bank.left == 0:
+        bank.serving = -1
+        channel.serving &= ~bit_at(b)
+        channel.num_serving -= 1
+
+
+@small
+def _row_time(channel, bank, group):  # type: ignore[no-untyped-def]
+    """The tick from which the row a bank needs may be opened, or the open one closed."""
+    if bank.open_row < 0:
+        return max(channel.rrd, bank.rp, bank.rc)
+    return max(bank.ras, bank.wtp, bank.rtp, group.rtpl)
+
+
+@small
+def _issue_row(machine, channel, bank, b):  # type: ignore[no-untyped-def]
+    """Open the row that a bank needs, or close the one that is open."""
+    tick = machine.tick
+    if bank.open_row < 0:
+        bank.open_row = bank.row
+        channel.rrd = tick + machine.rrd
+        bank.rcd = tick + machine.rcd
+        bank.rcdwr = tick + machine.rcdwr
+        bank.ras = tick + machine.ras
+        bank.rc = tick + machine.rc
+        machine.activates += 1
+        channel.column_from = 0
+    else:
+        bank.open_row = -1
+        bank.rp = tick + machine.rp
+        machine.precharges += 1
+    channel.priority = b + 1 if b + 1 < machine.num_dram_banks else 0
+
+
+@small
+def _around(start, count, num_banks):  # type: ignore[no-untyped-def]
+    """The mask of `count` banks from `start` on, around."""
+    mask = (bit_at(count) - U64(1)) << U64(start)
+    return mask | ((bit_at(count) - U64(1)) >> U64(num_banks - start))
+
+
+@compiled
+def _command(state, index, columns, rows):  # type: ignore[no-untyped-def]
+    """Try the banks in turn for a column command and a row command, where those are asked for.
+    Returns whether a column command issued; nothing is tried after it.
+
+    A row command passes the turn on, so that the pass goes on one bank further, over as many banks
+    as were left, for a column command alone. That is GPGPU-Sim's single bus.
+    """
     machine = state.pool.machine[0]
     memory = state.memory
     channel = memory.channels[index]
     tick = machine.tick
-    if channel.ccd > tick or channel.column_from > tick:
-        return False
-    left = channel.serving
-    soonest = NEVER
-    while left != 0:
-        b = _first_from(left, channel.priority)
-        left &= ~bit_at(b)
-        bank = memory.banks[index * MAX_DRAM_BANKS + b]
-        if bank.open_row != bank.row:
-            continue
-        group = memory.groups[index * MAX_DRAM_BANKS + (b & machine.group_mask)]
-        if bank.write:
-            may = max(group.ccdl, bank.rcdwr, channel.rtw)
-        else:
-            may = max(group.ccdl, bank.rcd, channel.wtr)
-        if may > tick:
-            soonest = min(soonest, may)
-            continue
-        if bank.write:
-            channel.is_writing = 1
-            channel.wtr = tick + machine.wtr
-            bank.wtp = tick + machine.wtp
-            delay = machine.wl
-            machine.dram_writes += 1
-        else:
-            channel.is_writing = 0
-            channel.rtw = tick + machine.rtw
-            bank.rtp = tick + machine.rtpl
-            group.rtpl = tick + machine.rtpl
-            delay = machine.cl
-            machine.dram_reads += 1
-        channel.ccd = tick + machine.ccd
-        group.ccdl = tick + machine.ccdl
-        room = memory.data_ring.shape[1] - 1
-        at = (channel.data_head + channel.data_count) & room
-        memory.data_ring[index, at] = bank.serving
-        memory.data_time[index, at] = tick + delay
-        channel.data_count += 1
-        bank.left -= 1
-        if bank.left == 0:
-            bank.serving = -1
-            channel.serving &= ~bit_at(b)
-            channel.num_serving -= 1
-        return True
-    channel.column_from = soonest
-    return False
-
-
-@compiled
-def _row_command(state, index):  # type: ignore[no-untyped-def]
-    """Open a row, or close one that is not the one asked for."""
-    machine = state.pool.machine[0]
-    memory = state.memory
-    channel = memory.channels[index]
-    tick = machine.tick
-    if channel.row_from > tick:
+    columns &= channel.ccd <= tick and channel.column_from <= tick
+    rows &= channel.row_from <= tick
+    if not columns and not rows:
         return False
     num_banks = machine.num_dram_banks
+    first = channel.priority
     left = channel.serving
-    soonest = NEVER
+    next_column, next_row = NEVER, NEVER
     while left != 0:
-        b = _first_from(left, channel.priority)
+        b = _first_from(left, first)
         left &= ~bit_at(b)
         bank = memory.banks[index * MAX_DRAM_BANKS + b]
-        row = bank.row
-        if bank.open_row < 0:
-            may = max(channel.rrd, bank.rp, bank.rc)
-            soonest = min(soonest, may)
+        group = memory.groups[index * MAX_DRAM_BANKS + (b & machine.group_mask)]
+        if bank.open_row == bank.row:
+            if columns:
+                may = _column_time(channel, bank, group)
+                if may <= tick:
+                    _issue_column(state, index, b)
+                    return True
+                next_column = min(next_column, may)
+        elif rows:
+            may = _row_time(channel, bank, group)
             if may <= tick:
-                bank.open_row = row
-                channel.rrd = tick + machine.rrd
-                bank.rcd = tick + machine.rcd
-                bank.rcdwr = tick + machine.rcdwr
-                bank.ras = tick + machine.ras
-                bank.rc = tick + machine.rc
-                channel.priority = b + 1 if b + 1 < num_banks else 0
-                machine.activates += 1
-                channel.column_from = 0
-                return True
-        elif bank.open_row != row:
-            group = memory.groups[index * MAX_DRAM_BANKS + (b & machine.group_mask)]
-            may = max(bank.ras, bank.wtp, bank.rtp, group.rtpl)
-            soonest = min(soonest, may)
-            if may <= tick:
-                bank.open_row = -1
-                bank.rp = tick + machine.rp
-                channel.priority = b + 1 if b + 1 < num_banks else 0
-                machine.precharges += 1
-                return True
-    channel.row_from = soonest
+                _issue_row(machine, channel, bank, b)
+                passed = b - first if b >= first else b - first + num_banks
+                if not columns or passed + 1 == num_banks:
+                    return False
+                rows = False
+                first = b + passed + 2
+                while first >= num_banks:
+                    first -= num_banks
+                left = channel.serving & _around(first, num_banks - 1 - passed, num_banks)
+                next_column = 0
+                next_row = 0
+            else:
+                next_row = min(next_row, may)
+    if columns:
+        channel.column_from = next_column
+    if rows:
+        channel.row_from = next_row
     return False
 
 
@@ -351,11 +386,10 @@ def step_channel(state, tags, index):  # type: ignore[no-untyped-def]
     if channel.pending > 0:
         _serve_bank(state, index)
     if channel.num_serving > 0:
-        if machine.dual_bus:
-            _column_command(state, index)
-            _row_command(state, index)
-        elif not _column_command(state, index):
-            _row_command(state, index)
+        if machine.in_bank_order:
+            _command(state, index, True, True)
+        elif not _command(state, index, True, False) or machine.dual_bus:
+            _command(state, index, False, True)
     _take_from_slices(state, tags, index)
     _leave_delay(state, index)
 

@@ -26,14 +26,19 @@ _BLOCK_ROWS = 4096
 I64 = np.int64
 
 
-def _operations(arithmetic: Sequence[tuple[str, int]], where: str) -> list[tuple[int, int]]:
-    """Micro-operations of (kind, count) pairs."""
+def _operations(arithmetic: Sequence[tuple[str, int]], where: str) -> list[tuple[int, int, int]]:
+    """Micro-operations of (kind, count) pairs, with the load whose data they take."""
     operations = []
+    # Loads of a group return in order: what waits for all but n takes the data of the last but n.
+    group = max([count for kind, count in arithmetic if kind == "wait"], default=-1) + 1
+    load = -1
     for kind, count in arithmetic:
         if kind not in KINDS or kind == "memory":
             allowed = ", ".join(k for k in KINDS if k != "memory")
             raise InputError(f"{where}: arithmetic kind {kind!r}: timing knows {allowed}")
-        operations.append((KINDS.index(kind), count))
+        if kind == "wait":
+            load = group - 1 - count
+        operations.append((KINDS.index(kind), count, load))
     return operations
 
 
@@ -81,7 +86,7 @@ class Feed:
         if fetch_path == "global" and gpu.l1.bypass_loads:
             path = PATH_BYPASS
         table = np.zeros(len(trace.instructions), records.INSTRUCTION)
-        self._ops: list[tuple[int, int]] = []
+        self._ops: list[tuple[int, int, int]] = []
         for k, one in enumerate(trace.instructions):
             code = int(self._program.operation[k])
             own_path = path
@@ -96,6 +101,7 @@ class Feed:
             table[k] = (
                 first, len(self._ops), code, own_path, quad,
                 int(self._program.access_bytes[k]), one.num_outstanding,
+                any(kind == "wait" for kind, _ in one.arithmetic) or one.num_outstanding >= 0,
             )  # fmt: skip
         self._instructions = table
 
@@ -112,13 +118,16 @@ class Feed:
         self._granule_head = 0
         self._num_warps = launch.num_ctas * launch.warps_per_cta - padding_warps
         trailer = _operations(launch.trailing_arithmetic, f"launch {launch.pass_name!r}")
-        operations = [*self._ops, *trailer, (CONTROL, 1)]
+        operations = [*self._ops, *trailer, (CONTROL, 1, -1)]
         values: dict[str, Any] = {
             "warps_per_cta": warps, "num_places": places, "trailer_first": len(self._ops),
             "trailer_last": len(operations), "queued": 0, "taken": 0, "complete": 0,
             "place_from": machine["now"] + machine["launch_cycles"], "age": 0,
             "last_sm": sm.count - 1, "progress": machine["now"] + machine["launch_cycles"],
         }  # fmt: skip
+        if machine["collector_units"] > 0:
+            # GPGPU-Sim's schedulers start their turns with an SM's first CTA.
+            values["first_turn"] = -(values["place_from"] + 1) % machine["num_schedulers"]
         for name, value in values.items():
             machine[name] = value
         state.sms["free_places"] = places

@@ -246,6 +246,7 @@ def build(gpu: Gpu, fetch_path: str, num_groups: int) -> State:
         "different_units": sm.dual_issue_different_units, "int_on_fp32": sm.int_on_fp32,
         "result_cycles": sm.result_cycles, "memory_cycles": sm.memory_cycles,
         "memory_queue": sm.memory_queue, "collector_units": sm.collector_units,
+        "register_banks": sm.register_banks,
         "quads_per_cycle": sm.texture_quads_per_cycle, "lines_per_cycle": l1_timing.lines_per_cycle,
         "bytes_per_cycle": l1_timing.bytes_per_cycle, "num_banks": l1_timing.num_banks,
         "bank_shift": _log2(l1_timing.bank_bytes), "l1_latency": latency,
@@ -256,13 +257,14 @@ def build(gpu: Gpu, fetch_path: str, num_groups: int) -> State:
         "num_llc": gpu.llc.num_slices if gpu.llc else 0, "has_llc": gpu.llc is not None,
         "num_channels": last.num_channels, "subslices": last.slices_per_channel,
         "sms_per_gl1": gpu.gl1.sms_per_instance if gpu.gl1 else 1,
-        "output_queued": icnt.queueing == "output-queued", "match_again": icnt.inputs_match_again,
+        "output_queued": icnt.queueing == "output-queued", "router_steps": icnt.router_steps,
         "flit_bytes": icnt.flit_bytes, "header_bytes": icnt.header_bytes,
         "input_packets": icnt.input_packets, "output_packets": icnt.output_packets,
         "l2_sector_shift": _log2(gpu.l2.sector_bytes), "llc_sector_shift": _log2(last.sector_bytes),
         "core_hz": gpu.clock_hz, "dram_hz": dram.clock_hz,
         "fixed_latency": dram.fixed_latency_cycles, "dram_queue": dram.queue,
-        "return_queue": dram.return_queue, "dual_bus": dram.dual_command_bus,
+        "return_queue": dram.return_queue, "dual_bus": dram.command_bus == "dual",
+        "in_bank_order": dram.command_bus == "bank-order",
         "fr_fcfs": dram.scheduler == "fr-fcfs", "num_dram_banks": dram.num_banks,
         "group_mask": dram.num_bank_groups - 1, "bursts": last.sector_bytes // dram.atom_bytes,
         "ccd": dram.ccd, "rrd": dram.rrd, "rcd": dram.rcd, "ras": dram.ras, "rp": dram.rp,
@@ -317,8 +319,6 @@ def build(gpu: Gpu, fetch_path: str, num_groups: int) -> State:
     sms["stall"] = records.R_IDLE
     sms["last_step"] = -1
     sms["last_issued"] = -1
-    sms["issued_slot"] = -1
-    sms["collector_slot"] = -1
     pipes = records.zeros(num_sms * units, records.PIPE)
     for field in ("warp", "next_writeback", "next_global"):
         pipes[field] = -1

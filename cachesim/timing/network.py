@@ -2,7 +2,10 @@
 
 "input-fifo" is a crossbar that matches the heads of its inputs to outputs once a cycle, each output
 taking the next input in turn (iSLIP with one iteration); a head whose output is taken blocks what
-is behind it, and a packet holds its output for whole cycles. "output-queued" has no such blocking:
+is behind it, and a packet holds its output for whole cycles. As a router it works in steps, some a
+cycle: in one an output is given to an input, in a later one that input's packet moves, if there is
+room; the output is free, and the input asks again, in the step after. "output-queued" has no such
+blocking:
 a packet waits at its output, which moves a flit's bytes a cycle, several small packets if they fit.
 """
 
@@ -49,10 +52,12 @@ def new_network(
 ) -> Network:
     """An empty network with room for so many packets at each input and output."""
     words = (inputs + 63) // 64
+    outlets = np.zeros(outputs, OUTLET)
+    outlets["given"] = -1
     return Network(
         np.zeros(inputs, PORT),
         np.zeros((inputs, power_of_two(input_packets)), PACKET),
-        np.zeros(outputs, OUTLET),
+        outlets,
         np.zeros((outputs, power_of_two(output_packets)), WAITING),
         np.full(outputs, NEVER, np.int64),
         np.zeros(words, np.uint64),
@@ -158,8 +163,36 @@ def _move(machine, net, output, now):  # type: ignore[no-untyped-def]
         port.busy = now + flits
     if port.count > 0:
         net.unready[word] |= bit
-        if flits == 1 and machine.match_again:
+        if flits == 1 and machine.router_steps == 0:
             _offer(net, best, now)
+
+
+@small
+def _offer_all(net, now):  # type: ignore[no-untyped-def]
+    for word in range(len(net.unready)):
+        left = net.unready[word]
+        while left != 0:
+            _offer(net, (word << 6) + lowest(left), now)
+            left = without_lowest(left)
+
+
+@compiled
+def _step_router(machine, net, now):  # type: ignore[no-untyped-def]
+    """One step of the router: outputs that are given move a packet, free ones are given."""
+    _offer_all(net, now)
+    for word in range(len(net.contested)):
+        left = net.contested[word]
+        while left != 0:
+            output = (word << 6) + lowest(left)
+            left = without_lowest(left)
+            outlet = net.outputs[output]
+            if outlet.given < 0:
+                outlet.given = _next_in_turn(net, output, outlet.turn)
+            elif outlet.count < machine.output_packets and outlet.busy <= now:
+                # It moves now: its turn is over.
+                outlet.turn = outlet.given
+                outlet.given = -1
+                _move(machine, net, output, now)
 
 
 @compiled
@@ -167,11 +200,11 @@ def transfer(machine, net, now):  # type: ignore[no-untyped-def]
     """One cycle of the crossbar: match heads to outputs, and move what was matched."""
     if net.scalars[AT_INPUTS] == 0:
         return
-    for word in range(len(net.unready)):
-        left = net.unready[word]
-        while left != 0:
-            _offer(net, (word << 6) + lowest(left), now)
-            left = without_lowest(left)
+    if machine.router_steps > 0:
+        for _ in range(machine.router_steps):
+            _step_router(machine, net, now)
+        return
+    _offer_all(net, now)
     for word in range(len(net.contested)):
         # An input that has moved a packet may ask for a later output in the same cycle.
         later = ~U64(0)

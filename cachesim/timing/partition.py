@@ -16,6 +16,8 @@ U64 = np.uint64
 #: place, and its 31 numbers.
 DRAWN, NEXT, NUMBERS = 0, 1, 2
 TABLE = NUMBERS + 31
+#: Where GPGPU-Sim's traces have their code; 16 bytes an instruction.
+_CODE = 0xF0000000
 _LAG = 31
 #: Bits of an entry that hold the slice; those above hold the run.
 _SLICE_BITS = 16
@@ -95,6 +97,15 @@ def _drawn(route, address):  # type: ignore[no-untyped-def]
         route.draws[at] = run << _SLICE_BITS | where
         route.draws[DRAWN] += 1
     return route.draws[at] & _SLICES
+
+
+@compiled
+def draw_code(route, pair):  # type: ignore[no-untyped-def]
+    """A warp fetches its instructions number 2 x `pair` and the next: in GPGPU-Sim that is a first
+    touch like any other, though instructions always hit.
+    """
+    if route.numbers[3] == RANDOM and pair & 3 == 0:
+        _drawn(route, np.int64(_CODE + (pair << 5)))
 
 
 @small

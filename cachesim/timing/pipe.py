@@ -20,13 +20,26 @@ from cachesim.timing.load_store import issue_accesses, take_instruction
 from cachesim.timing.lookup import drain_misses, look_up, returned
 from cachesim.timing.records import (
     FAIL,
+    MAX_WARPS,
     NEVER,
     PATH_BYPASS,
     PATH_FIFO,
 )
 from cachesim.timing.tags import next_ready
+from cachesim.timing.units import LOADED, write_register
 from cachesim.timing.uplink import send_up
 from cachesim.timing.warp import store_done
+
+
+@small
+def _write_register(state, request):  # type: ignore[no-untyped-def]
+    """A loaded sector enters its register bank."""
+    machine = state.pool.machine[0]
+    one = state.pool.requests[request]
+    register = LOADED + one.load - state.warps[one.warp].group
+    scheduler = (one.warp & (MAX_WARPS - 1)) % machine.num_schedulers
+    sm = state.sms[one.warp // MAX_WARPS]
+    write_register(sm, scheduler, register % machine.register_banks, machine.now)
 
 
 @small
@@ -37,6 +50,8 @@ def _write_back(state, unit):  # type: ignore[no-untyped-def]
     machine = state.pool.machine[0]
     pipe = state.pipes[unit]
     if pipe.next_writeback >= 0:
+        if machine.register_banks > 0:
+            _write_register(state, pipe.next_writeback)
         returned(state, pipe.next_writeback)
         pipe.next_writeback = -1
     for c in range(5):

@@ -18,6 +18,7 @@ MAX_LOADS = 64
 MAX_DRAM_BANKS = 64
 MAX_MEMORY_QUEUE = 64
 MAX_COLLECTORS = 8
+MAX_REGISTER_BANKS = 8
 MAX_SUBSLICES = 8
 MAX_WAYS = (1 << 15) - 1
 MAX_SMS = (1 << 15) // MAX_WARPS - 1
@@ -187,6 +188,23 @@ LEVEL = np.dtype(
     ]
 )  # fmt: skip
 
+#: An instruction on its way to its unit.
+ISSUED = np.dtype(
+    [
+        ("order", "i8"),  # of issue
+        ("row", "i8"),  # of an access
+        ("load", "i4"),
+        ("since", "i4"),  # order of entry into the collector
+        ("slot", "i1"),
+        ("kind", "i1"),
+        ("chain", "i1"),  # -1: an exit
+        # Register banks to read, and those of them that are read twice.
+        ("banks", "u1"),
+        ("again", "u1"),
+    ],
+    align=True,
+)
+
 #: What LDST and issue logic of one SM need.
 SM = _in_lines(
     # Two lines: what every step looks at.
@@ -209,25 +227,25 @@ SM = _in_lines(
     ("stall", "i1", (MAX_SCHEDULERS,)),  # why each scheduler that did not issue did not
     ("queue_count", "i1", (MAX_SCHEDULERS,)),
     ("queue_head", "i1", (MAX_SCHEDULERS,)),
-    # GPGPU-Sim's operand collectors: issued[kind, scheduler], then collector[unit, scheduler].
-    ("num_issued", "i1", (8,)),  # of each kind, not yet in a collector
+    # GPGPU-Sim's operand collectors, MAX_COLLECTORS places for each scheduler. Masks of places:
+    # those in use, and of them those that wait for operands and those that hold an access.
+    ("collecting", "u8"),
+    ("reading", "u8"),
+    ("accesses", "u8"),
+    ("order", "i8"),  # of issue, and of entry into a collector
     ("resident_since", "i8"),
-    ("order", "i8"),
-    ("issued_slot", "i1", (5, MAX_SCHEDULERS)),
-    ("issued_kind", "i1", (5, MAX_SCHEDULERS)),
-    ("issued_chain", "i1", (5, MAX_SCHEDULERS)),
-    ("collector_slot", "i1", (MAX_COLLECTORS, MAX_SCHEDULERS)),
-    ("collector_ready", "i1", (MAX_COLLECTORS, MAX_SCHEDULERS)),
-    ("collector_kind", "i1", (MAX_COLLECTORS, MAX_SCHEDULERS)),
-    ("collector_chain", "i1", (MAX_COLLECTORS, MAX_SCHEDULERS)),
+    # By unit: the schedulers whose issued instruction waits for a collector, as a mask and in
+    # order, four bits each, the oldest lowest.
+    ("waiting", "u1", (8,)),
+    ("turn", "u4", (5,)),
+    # An issued instruction of each unit and scheduler, then one in each collector.
+    ("issued", ISSUED, (5, MAX_SCHEDULERS)),
+    ("collector", ISSUED, (MAX_SCHEDULERS * MAX_COLLECTORS,)),
+    # Register banks written last, MAX_REGISTER_BANKS bits for each scheduler, and when.
+    ("written", "u8"),
+    ("written_at", "i8"),
     ("unit_free", "i8", (4, MAX_SCHEDULERS)),
     ("last_issued", "i4", (MAX_SCHEDULERS,)),
-    ("issued_order", "i8", (5, MAX_SCHEDULERS)),
-    ("issued_row", "i8", (MAX_SCHEDULERS,)),
-    ("issued_load", "i4", (MAX_SCHEDULERS,)),
-    ("collector_order", "i8", (MAX_COLLECTORS, MAX_SCHEDULERS)),
-    ("collector_row", "i8", (MAX_COLLECTORS, MAX_SCHEDULERS)),
-    ("collector_load", "i4", (MAX_COLLECTORS, MAX_SCHEDULERS)),
     # Queues of the load/store unit, place by place: most hold one.
     ("queue_warp", "i4", (MAX_MEMORY_QUEUE, MAX_SCHEDULERS)),
     ("queue_time", "i8", (MAX_MEMORY_QUEUE, MAX_SCHEDULERS)),
@@ -308,6 +326,8 @@ WARP = _in_lines(
     ("exit_ready", "i8"),  # when its exit has left the pipeline
     ("chains_ready", "i8", (3,)),
     ("cta", "i4"),  # place
+    ("num_pairs", "i4"),  # of instructions, issued so far
+    ("group", "i4"),  # first load of its present group
     ("pending", "i2", (MAX_LOADS,)),
 )
 
@@ -321,10 +341,12 @@ INSTRUCTION = np.dtype(
         ("quad_cost", "i4"),  # cycles of one quad in a texture filter, 0 = no filter
         ("access_bytes", "i4"),
         ("num_outstanding", "i4"),
+        ("waits", "i4"),  # whether loads are waited for before it: it begins a group
     ],
     align=True,
 )
-OPERATION = np.dtype([("kind", "i4"), ("count", "i4")])
+#: load: the place in its group of the load whose data the instructions take, -1 = none.
+OPERATION = np.dtype([("kind", "i4"), ("count", "i4"), ("load", "i4")])
 
 #: A row that waits in an SM: an access instruction of one warp.
 ROW = np.dtype(
@@ -336,7 +358,10 @@ ROW = np.dtype(
 ASK = np.dtype([("line", "i8"), ("group", "i4"), ("mask", "u1")], align=True)
 
 PORT = np.dtype([("head", "i4"), ("count", "i4"), ("busy", "i8")], align=True)
-OUTLET = np.dtype([("busy", "i8"), ("head", "i4"), ("count", "i4"), ("turn", "i4")], align=True)
+#: given: the input that a router has given the output to, or -1.
+OUTLET = np.dtype(
+    [("busy", "i8"), ("head", "i4"), ("count", "i4"), ("turn", "i4"), ("given", "i4")], align=True
+)
 #: A packet at an input, and one at an output. time: the cycle from which it may move on.
 PACKET = np.dtype(
     [
@@ -418,14 +443,15 @@ MACHINE = np.dtype(
             # rules
             "num_sms", "units", "num_schedulers", "is_gto", "issue_per_warp", "different_units",
             "int_on_fp32", "result_cycles", "memory_cycles", "memory_queue", "collector_units",
+            "register_banks",
             "quads_per_cycle", "lines_per_cycle", "bytes_per_cycle", "num_banks", "bank_shift",
             "l1_latency", "bypass", "has_fifo_l1", "fragment_fifo", "request_fifo", "rob",
             "result_fifo", "launch_cycles", "cta_launch_cycles", "ejection",
             "response", "num_ports", "num_slices", "num_gl1", "num_llc", "num_channels",
-            "sms_per_gl1", "subslices", "output_queued", "match_again", "flit_bytes",
+            "sms_per_gl1", "subslices", "output_queued", "router_steps", "flit_bytes",
             "header_bytes", "input_packets", "output_packets",
             "l2_sector_shift", "core_hz", "dram_hz", "fixed_latency", "dram_queue",
-            "return_queue", "dual_bus", "fr_fcfs", "num_dram_banks", "group_mask", "bursts",
+            "return_queue", "dual_bus", "in_bank_order", "fr_fcfs", "num_dram_banks", "group_mask", "bursts",
             "ccd", "rrd", "rcd", "rcdwr", "ras", "rp", "rc", "cl", "wl", "rtw", "wtr", "wtp",
             "rtp", "ccdl", "rtpl", "shared_credits", "llc_sector_shift", "channel_shift",
             "num_pool", "warps_per_cta", "num_places", "sector_shift",
@@ -438,7 +464,7 @@ MACHINE = np.dtype(
             "ctas_done", "trailer_first", "trailer_last", "queued_dram",
             "dram_reads", "dram_writes", "row_hits", "activates", "precharges",
             "store_bytes", "line_parts", "sectors_per_cycle", "returns_per_cycle",
-            "replies_per_cycle",
+            "replies_per_cycle", "first_turn",
         )
     ]
 )  # fmt: skip

@@ -90,7 +90,8 @@ def _has_room(state, index, scheduler, kind, now):  # type: ignore[no-untyped-de
     machine = state.pool.machine[0]
     sm = state.sms[index]
     if machine.collector_units > 0:
-        return sm.issued_slot[unit_of(machine, kind), scheduler] < 0
+        unit = kind if kind == MEMORY else unit_of(machine, kind)
+        return (sm.waiting[unit] >> scheduler) & 1 == 0
     if kind == MEMORY:
         return sm.queue_count[scheduler] < machine.memory_queue
     return sm.unit_free[unit_of(machine, kind), scheduler] <= now + AHEAD
@@ -252,7 +253,7 @@ def step_sm(state, index):  # type: ignore[no-untyped-def]
     issuers = 0
     if sm.num_resident > 0 and not sm.is_stuck:
         ready = sm.ready[0] | sm.ready[1] | sm.ready[2] | sm.ready[3] | sm.ready[4]
-        scheduler = now % machine.num_schedulers
+        scheduler = (now + machine.first_turn) % machine.num_schedulers
         for _ in range(machine.num_schedulers):
             if ready & state.scheduler_masks[scheduler]:
                 found = _issue(state, index, scheduler)

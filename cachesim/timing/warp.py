@@ -12,6 +12,7 @@ import numpy as np
 from cachesim.compiled import compiled, small
 from cachesim.stream import STORE
 from cachesim.timing.bits import bit_at, lowest, without_lowest
+from cachesim.timing.partition import draw_code
 from cachesim.timing.records import MAX_LOADS, MAX_WARPS, MEMORY, NEVER, WAIT, WHEEL
 
 
@@ -211,6 +212,9 @@ def advance(state, index, slot, now, again):  # type: ignore[no-untyped-def]
             warp.last_operation = machine.trailer_last
             warp.in_trailer = 1
         warp.left = -1
+    if machine.collector_units > 0 and warp.parity == 0:
+        warp.num_pairs += 1
+        draw_code(state.l2_route, warp.num_pairs)
     schedule(state, index, slot, now if again else now + 1)
 
 
@@ -228,6 +232,10 @@ def start_warp(state, index, slot, place, first, rows, age):  # type: ignore[no-
     warp.parity = 0
     warp.waits_for = -1
     warp.waits_chain = -1
+    warp.num_pairs = 0
+    if machine.collector_units > 0:
+        draw_code(state.l2_route, 0)
+    warp.group = 0
     warp.next_load = 0
     warp.oldest_load = 0
     warp.stores = 0
