@@ -753,7 +753,7 @@ def test_the_command_writes_a_preset_and_says_what_it_ignored(
     command = ["import-config", "TINY/a.config", "--trace-config", "TINY/trace.config"]
     assert run_command([*command, "-o", "mine.toml"]) == 0
     said = capsys.readouterr()
-    assert said.out.startswith("wrote mine.toml: 127 fields")
+    assert said.out.startswith("wrote mine.toml: 128 fields")
     assert "ignored (the power model): -power_simulation_enabled 0" in said.err
     # Not an emoji.
     assert "(instructions and constants always hit): -gpgpu_cache:il1 N:8:128:4,L:R:m:N" in said.err

@@ -212,7 +212,7 @@ def advance(state, index, slot, now, again):  # type: ignore[no-untyped-def]
             warp.last_operation = machine.trailer_last
             warp.in_trailer = 1
         warp.left = -1
-    if machine.collector_units > 0 and warp.parity == 0:
+    if machine.collector_units > 0 and warp.parity == 0 and not has_exited(warp):
         warp.num_pairs += 1
         draw_code(state.l2_route, warp.num_pairs)
     schedule(state, index, slot, now if again else now + 1)
