@@ -21,9 +21,9 @@ from cachesim.timing.records import (
     FP32,
     INT,
     MAX_COLLECTORS,
+    MAX_REGISTER_BANKS,
     MAX_WARPS,
     MEMORY,
-    MAX_REGISTER_BANKS,
     NEVER,
     SFU,
 )
