@@ -67,7 +67,7 @@ def small_gpus(draw) -> Gpu:
         fields["l1_texture.line_bytes"] = fields["l1.line_bytes"]
         fields["l1_texture.capacity"] = fields["l1.line_bytes"] * fields["l1_texture.ways"] * 3
         fields["l1_texture.units_per_sm"] = 1
-    if fields["l1.write_policy"] == "write-back":
+    if "write-back" in (fields["l1.write_policy"], fields.get("l1_texture.write_policy")):
         # A launch's end may write back in any order, so nothing below may depend on it.
         for path in ("l2", "llc"):
             if f"{path}.ways" in fields:

@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from timing_machines import cycles_of, one_sm, sectors, single_lane, taken, timed
 
 from cachesim.timing.machine import build
-from cachesim.timing.network import arrival, new_network, pop, push, transfer
+from cachesim.timing.network import new_network, push
 from cachesim.timing.partition import DRAWN
 from cachesim.timing.units import registers_written, write_register
-from tests.timing_machines import cycles_of, one_sm, sectors, single_lane, timed
 
 # Operand collectors ---------------------------------------------------------------------------
 
@@ -77,7 +77,7 @@ def test_the_schedulers_turns_start_with_the_first_cta() -> None:
 # BookSim's router -----------------------------------------------------------------------------
 
 
-def taken(steps: int, wanted: list[list[int]], cycles: int = 40) -> list[list[tuple[int, int]]]:
+def routed(steps: int, wanted: list[list[int]]) -> list[list[tuple[int, int]]]:
     """Per output, (cycle, input) of the packets in their order. wanted: outputs, by input."""
     machine: Any = build(one_sm(f"icnt.router_steps={steps}"), "readonly", 1).pool.machine[0]
     outputs = 1 + max(output for packets in wanted for output in packets)
@@ -85,13 +85,7 @@ def taken(steps: int, wanted: list[list[int]], cycles: int = 40) -> list[list[tu
     for source, packets in enumerate(wanted):
         for output in packets:
             push(machine, net, source, output, source, 0, 0)
-    found: list[list[tuple[int, int]]] = [[] for _ in range(outputs)]
-    for now in range(cycles):
-        for output in range(outputs):
-            while arrival(net, output) <= now:
-                found[output].append((now, int(pop(net, output)[0])))
-        transfer(machine, net, now)
-    return found
+    return taken(machine, net, 40)
 
 
 @pytest.mark.parametrize(("steps", "cycles_a_packet"), [(1, 2), (2, 1), (4, 1)])
@@ -99,7 +93,7 @@ def test_a_router_gives_an_output_in_one_step_and_uses_it_in_the_next(
     steps: int, cycles_a_packet: int
 ) -> None:
     """Three inputs for one output are served in turn; its channel moves one packet a cycle."""
-    [found] = taken(steps, [[0] * 4] * 3)
+    [found] = routed(steps, [[0] * 4] * 3)
     assert [source for _, source in found] == [0, 1, 2] * 4
     assert np.unique(np.diff([cycle for cycle, _ in found])).tolist() == [cycles_a_packet]
 
@@ -109,9 +103,9 @@ def test_a_router_frees_an_input_within_a_cycle() -> None:
     and a crossbar that works once a cycle is no faster.
     """
     wanted = [[0], [0, 1]]
-    (_, (second, _)), [(behind, _)] = taken(2, wanted)
+    (_, (second, _)), [(behind, _)] = routed(2, wanted)
     assert behind <= second + 1
-    (_, (second, _)), [(behind, _)] = taken(1, wanted)
+    (_, (second, _)), [(behind, _)] = routed(1, wanted)
     assert behind >= second + 2
 
 

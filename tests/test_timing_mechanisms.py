@@ -17,6 +17,7 @@ from timing_machines import (
     sectors,
     single_lane,
     stepped,
+    taken,
     timed,
 )
 
@@ -25,7 +26,7 @@ from cachesim.config import Gpu
 from cachesim.counts import ACCESSES
 from cachesim.timing.clock import Clock
 from cachesim.timing.machine import build
-from cachesim.timing.network import arrival, has_room, new_network, pop, push, transfer
+from cachesim.timing.network import has_room, new_network, push
 from traces.errors import InputError, WorkError
 from traces.synthetic import gather
 from traces.texture import Texture, pack_texel
@@ -221,18 +222,6 @@ def crossbar(queueing: str, inputs: int, outputs: int) -> tuple[Any, Any]:
     gpu = one_sm(f"icnt.queueing={queueing}")
     machine = build(gpu, "readonly", 1).pool.machine
     return machine[0], new_network(inputs, outputs, 128, 128, 0)
-
-
-def taken(machine: Any, net: Any, cycles: int) -> list[list[tuple[int, int]]]:
-    """Per output, (cycle, packet) in the order they can be taken."""
-    outputs = len(net.outputs)
-    found: list[list[tuple[int, int]]] = [[] for _ in range(outputs)]
-    for now in range(cycles):
-        for output in range(outputs):
-            while arrival(net, output) <= now:
-                found[output].append((now, int(pop(net, output)[0])))
-        transfer(machine, net, now)
-    return found
 
 
 def test_the_crossbar_serves_its_inputs_in_turn() -> None:

@@ -12,6 +12,7 @@ from cachesim import presets
 from cachesim.config import Gpu
 from cachesim.timing import engine
 from cachesim.timing.clock import Clock
+from cachesim.timing.network import arrival, pop, transfer
 from cachesim.timing.room import with_more_room
 from cachesim.timing.state import State
 from traces.lane_address import lane_address_trace
@@ -186,6 +187,17 @@ def stepped(trace: Trace, gpu: Gpu, path: str | None = None) -> Iterator[State]:
         yield clock.state
         if why == engine.DONE:
             return
+
+
+def taken(machine: Any, net: Any, cycles: int) -> list[list[tuple[int, int]]]:
+    """Per output of a network, (cycle, packet) in the order they can be taken."""
+    found: list[list[tuple[int, int]]] = [[] for _ in net.outputs]
+    for now in range(cycles):
+        for output, packets in enumerate(found):
+            while arrival(net, output) <= now:
+                packets.append((now, int(pop(net, output)[0])))
+        transfer(machine, net, now)
+    return found
 
 
 def held_in(clock: Clock) -> dict[str, int]:

@@ -5,8 +5,8 @@ taking the next input in turn (iSLIP with one iteration); a head whose output is
 is behind it, and a packet holds its output for whole cycles. As a router it works in steps, some a
 cycle: in one an output is given to an input, in a later one that input's packet moves, if there is
 room; the output is free, and the input asks again, in the step after. "output-queued" has no such
-blocking:
-a packet waits at its output, which moves a flit's bytes a cycle, several small packets if they fit.
+blocking: a packet waits at its output, which moves a flit's bytes a cycle, several small packets if
+they fit.
 """
 
 from __future__ import annotations
@@ -139,17 +139,16 @@ def _next_in_turn(net, output, turn):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _move(machine, net, output, now):  # type: ignore[no-untyped-def]
-    """Move the packet of the input whose turn it is to an output."""
+def _move(machine, net, source, output, now):  # type: ignore[no-untyped-def]
+    """Move the first packet of an input to its output; the turn passes to the input after it."""
     outlet = net.outputs[output]
-    best = _next_in_turn(net, output, outlet.turn)
-    port = net.inputs[best]
-    head = net.in_ring[best, port.head & (net.in_ring.shape[1] - 1)]
+    port = net.inputs[source]
+    head = net.in_ring[source, port.head & (net.in_ring.shape[1] - 1)]
     flits = np.int64(head.flits)
     _arrive(net, output, head.request, now + flits + net.scalars[LATENCY], head.entered)
     outlet.busy = now + flits
-    outlet.turn = best + 1 if best + 1 < len(net.inputs) else 0
-    word, bit = best >> 6, bit_at(best & 63)
+    outlet.turn = source + 1 if source + 1 < len(net.inputs) else 0
+    word, bit = source >> 6, bit_at(source & 63)
     net.wanted[output, word] &= ~bit
     others = U64(0)
     for k in range(net.wanted.shape[1]):
@@ -164,7 +163,7 @@ def _move(machine, net, output, now):  # type: ignore[no-untyped-def]
     if port.count > 0:
         net.unready[word] |= bit
         if flits == 1 and machine.router_steps == 0:
-            _offer(net, best, now)
+            _offer(net, source, now)
 
 
 @small
@@ -189,10 +188,9 @@ def _step_router(machine, net, now):  # type: ignore[no-untyped-def]
             if outlet.given < 0:
                 outlet.given = _next_in_turn(net, output, outlet.turn)
             elif outlet.count < machine.output_packets and outlet.busy <= now:
-                # It moves now: its turn is over.
-                outlet.turn = outlet.given
+                source = outlet.given
                 outlet.given = -1
-                _move(machine, net, output, now)
+                _move(machine, net, source, output, now)
 
 
 @compiled
@@ -214,7 +212,7 @@ def transfer(machine, net, now):  # type: ignore[no-untyped-def]
             output = (word << 6) + place
             outlet = net.outputs[output]
             if outlet.count < machine.output_packets and outlet.busy <= now:
-                _move(machine, net, output, now)
+                _move(machine, net, _next_in_turn(net, output, outlet.turn), output, now)
 
 
 @small

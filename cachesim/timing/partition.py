@@ -100,12 +100,12 @@ def _drawn(route, address):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def draw_code(route, pair):  # type: ignore[no-untyped-def]
-    """A warp fetches its instructions number 2 x `pair` and the next: in GPGPU-Sim that is a first
-    touch like any other, though instructions always hit.
+def draw_code(route, instruction):  # type: ignore[no-untyped-def]
+    """A warp comes to this instruction of a trace: in GPGPU-Sim its code's line is a first touch
+    like any other, though instructions always hit.
     """
-    if route.numbers[3] == RANDOM and pair & 3 == 0:
-        _drawn(route, np.int64(_CODE + (pair << 5)))
+    if instruction & 7 == 0:
+        _drawn(route, np.int64(_CODE + (instruction << 4)))
 
 
 @small

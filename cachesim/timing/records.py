@@ -321,12 +321,11 @@ WARP = _in_lines(
     ("int_ready", "i8"),
     ("rows_left", "i8"),
     ("waits_chain", "i4"),  # for the unknown end of this chain, or -1
-    ("parity", "i2"),
-    ("alive", "i2"),
+    ("alive", "i4"),
     ("exit_ready", "i8"),  # when its exit has left the pipeline
     ("chains_ready", "i8", (3,)),
     ("cta", "i4"),  # place
-    ("num_pairs", "i4"),  # of instructions, issued so far
+    ("num_issued", "i4"),  # instructions
     ("group", "i4"),  # first load of its present group
     ("pending", "i2", (MAX_LOADS,)),
 )

@@ -140,8 +140,8 @@ def _issue(state, index, scheduler):  # type: ignore[no-untyped-def]
         issued += 1
         previous = unit
         # Instructions are fetched in pairs; only the two of a pair can issue together.
-        again = issued < machine.issue_per_warp and warp.parity == 0
-        warp.parity ^= 1
+        again = issued < machine.issue_per_warp and warp.num_issued & 1 == 0
+        warp.num_issued += 1
         advance(state, index, slot, now, again)
         if not again or not warp.alive:
             break

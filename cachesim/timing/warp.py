@@ -12,7 +12,7 @@ import numpy as np
 from cachesim.compiled import compiled, small
 from cachesim.stream import STORE
 from cachesim.timing.bits import bit_at, lowest, without_lowest
-from cachesim.timing.partition import draw_code
+from cachesim.timing.partition import draw_code, is_drawn
 from cachesim.timing.records import MAX_LOADS, MAX_WARPS, MEMORY, NEVER, WAIT, WHEEL
 
 
@@ -186,6 +186,13 @@ def store_done(state, warp_index):  # type: ignore[no-untyped-def]
     _unblock(state, warp_index)
 
 
+@small
+def _fetch_code(state, warp):  # type: ignore[no-untyped-def]
+    """Where slices are drawn, the warp's next instruction may be the first touch of its code."""
+    if state.pool.machine[0].collector_units > 0 and is_drawn(state.l2_route):
+        draw_code(state.l2_route, warp.num_issued)
+
+
 @compiled
 def advance(state, index, slot, now, again):  # type: ignore[no-untyped-def]
     """The warp has issued its next instruction; find the one after it. again: it may issue once
@@ -212,9 +219,8 @@ def advance(state, index, slot, now, again):  # type: ignore[no-untyped-def]
             warp.last_operation = machine.trailer_last
             warp.in_trailer = 1
         warp.left = -1
-    if machine.collector_units > 0 and warp.parity == 0 and not has_exited(warp):
-        warp.num_pairs += 1
-        draw_code(state.l2_route, warp.num_pairs)
+    if not has_exited(warp):
+        _fetch_code(state, warp)
     schedule(state, index, slot, now if again else now + 1)
 
 
@@ -229,12 +235,10 @@ def start_warp(state, index, slot, place, first, rows, age):  # type: ignore[no-
     warp.rows_left = rows
     warp.left = -1
     warp.chain = 0
-    warp.parity = 0
     warp.waits_for = -1
     warp.waits_chain = -1
-    warp.num_pairs = 0
-    if machine.collector_units > 0:
-        draw_code(state.l2_route, 0)
+    warp.num_issued = 0
+    _fetch_code(state, warp)
     warp.group = 0
     warp.next_load = 0
     warp.oldest_load = 0
