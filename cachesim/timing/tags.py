@@ -46,9 +46,12 @@ class Tags(NamedTuple):
 
 @small
 def spread(key):  # type: ignore[no-untyped-def]
-    """A hash of a line or sector number for the chains; eight neighbours share a host line."""
+    """A hash of a line or sector number for the chains; eight neighbours share a host line, each
+    eight in an order of their own, for what is far apart is often a multiple of eight apart.
+    """
     run = key >> 3
-    return ((((run * 0x1E3779B97F4A7C15) >> 29) ^ (run >> 7)) << 3) | (key & 7)
+    mixed = run * 0x1E3779B97F4A7C15
+    return (((mixed >> 29) ^ (run >> 7)) << 3) | ((key ^ (mixed >> 40)) & 7)
 
 
 @small
