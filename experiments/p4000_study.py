@@ -189,6 +189,7 @@ def _pass_row(part: PassTiming, report: Report) -> Cell:
         row[f"{level}_miss_rate"] = counts.miss_rate
     row["dram_mb"] = sum(p.dram.bytes for p in parts) / 1e6
     row["dram_of_peak"] = part.utilisation("dram") if "dram" in part.levels else None
+    row["rows_opened"] = part.rows_opened
     return row
 
 

@@ -92,6 +92,9 @@ def _traffic(part: Cell) -> str:
     text += f" and {three_digits(part['dram_mb'])} MB of DRAM"
     if part["dram_of_peak"] is not None:
         text += f", {part['dram_of_peak']:.0%} of what its bus could move in that time"
+    # Cells of earlier versions do not have it.
+    if part.get("rows_opened"):
+        text += f", a row opened for every {part['dram_mb'] * 1e6 / part['rows_opened']:.0f} B"
     return text + "."
 
 

@@ -112,6 +112,9 @@ def notes(timing: TimingResult, gpu: Gpu) -> tuple[str, ...]:
     if total.bottleneck not in ("issue", "launch"):
         issued = share_of_cycles(total, "issue")
         meaning += f" Instructions issued in {issued:.0%} of the schedulers' cycles."
+    if total.bottleneck == "dram" and total.rows_opened:
+        each = total.levels["dram"].bytes / total.rows_opened
+        meaning += f" A row was opened for every {each:.0f} B."
     lines = [bottleneck_line(total), meaning]
     for part in timing.passes:
         if part.bottleneck != total.bottleneck:

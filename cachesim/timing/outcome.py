@@ -38,6 +38,7 @@ class Snapshot:
     resident: int
     served: tuple[int, ...]
     dram: tuple[int, int]
+    rows_opened: int
 
     @staticmethod
     def take(state: State) -> Snapshot:
@@ -56,6 +57,7 @@ class Snapshot:
             int(state.resident[0]),
             tuple(served),
             (int(machine["dram_reads"]), int(machine["dram_writes"])),
+            int(machine["activates"]),
         )
 
 
@@ -71,24 +73,55 @@ def _shares(total: int, weights: dict[str, int]) -> dict[str, int]:
     return parts
 
 
-def _where(before: Snapshot, after: Snapshot, num_slots: int, launch: int) -> dict[str, int]:
-    """Reason -> cycles of one launch. num_slots: schedulers of all SMs."""
-    spent = after.reasons - before.reasons
+def _queues(before: Snapshot, after: Snapshot, gpu: Gpu) -> tuple[dict[str, int], int]:
+    """Request-cycles that a launch's requests queued for each level, and those that the way to the
+    L2 or memory and back would have taken without queues.
+
+    What queues before a level that cannot take it queues for the one behind: as full as memory's
+    queues were on average, so much of the waiting before it is memory's, and so at the L2.
+    """
+    assert gpu.l2_timing and gpu.dram_timing
     waits = after.waits - before.waits
     least = np.where(after.waits[:, 2] < NEVER, after.waits[:, 2], 0)
-    queued = np.maximum(0, waits[:, 0] - waits[:, 1] * least)
+    unloaded = waits[:, 1] * least
+    queued = np.maximum(0, waits[:, 0] - unloaded)
+    request, l2, dram = (int(queued[k]) for k in (records.S_REQUEST, records.S_L2, records.S_BELOW))
+    cycles = max(1, after.now - before.now)
+    room = cycles * (gpu.llc or gpu.l2).num_channels * gpu.dram_timing.queue
+    held_back, behind = min(dram, room), l2 + request
+    dram += behind * held_back // room
+    l2 -= l2 * held_back // room
+    request -= request * held_back // room
+    room = cycles * gpu.l2.num_slices * gpu.l2_timing.queue_in
+    held_back = request * min(l2, room) // room
+    l2, request = l2 + held_back, request - held_back
+    queues = {"interconnect": request + int(queued[records.S_REPLY]), "l2": l2, "dram": dram}
+    return queues, int(unloaded.sum())
+
+
+def _where(before: Snapshot, after: Snapshot, gpu: Gpu, launch: int) -> dict[str, int]:
+    """Reason -> cycles of one launch.
+
+    Slots that wait for data are shared out by what the requests spend their time with. So are those
+    whose access cannot leave the L1, because its MSHRs or the network are full: they are full
+    because requests stay long. What would be full without queues, too, stays with them.
+    """
+    assert gpu.sm_timing
+    spent = after.reasons - before.reasons
+    queues, unloaded = _queues(before, after, gpu)
     latency = int((after.latency - before.latency)[:, 0].sum())
-    memory = {
-        "interconnect": int(queued[records.S_REQUEST] + queued[records.S_REPLY]),
-        "l2": int(queued[records.S_L2]),
-        "dram": int(queued[records.S_BELOW]),
-    }
-    memory["latency"] = max(0, latency - sum(memory.values()))
-    shared = _shares(int(spent[R_MEMORY]), memory)
     slots = {name: int(spent[code]) for name, code in _DIRECT.items()}
-    for name, share in shared.items():
-        slots[name] = slots.get(name, 0) + share
+    waiting = [(int(spent[R_MEMORY]), "latency", max(0, latency - sum(queues.values())))]
+    for name in ("l1_reservation", "interconnect"):
+        if sum(queues.values()) > 0:
+            waiting.append((slots.pop(name), name, unloaded))
+    for total, own, rest in waiting:
+        weights = dict(queues)
+        weights[own] = weights.get(own, 0) + rest
+        for name, share in _shares(total, weights).items():
+            slots[name] = slots.get(name, 0) + share
     # While the kernel is launched every SM is idle.
+    num_slots = gpu.sm.count * gpu.sm_timing.num_schedulers
     slots["idle"] = max(0, slots["idle"] - launch * num_slots)
     cycles = _shares(after.now - before.now - launch, slots)
     cycles["launch"] = launch
@@ -147,12 +180,13 @@ def passes_of(name: str, before: Snapshot, after: Snapshot, gpu: Gpu, state: Sta
         1,
         after.now - before.now,
         launch,
-        _where(before, after, gpu.sm.count * gpu.sm_timing.num_schedulers, launch),
+        _where(before, after, gpu, launch),
         {kind: int(issued[k]) for k, kind in enumerate(KINDS[:5])},
         after.resident - before.resident,
         gpu.sm.count * (after.now - before.now - launch),
         gpu.sm.max_warps,
         levels,
+        after.rows_opened - before.rows_opened,
     )
 
 

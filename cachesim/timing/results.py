@@ -16,7 +16,8 @@ REASONS: dict[str, str] = {
     "issue": "the schedulers issued instructions",
     "arithmetic": "most warps waited for an execution unit or its result",
     "l1_bandwidth": "memory instructions waited for the L1's ports, tags, banks or filters",
-    "l1_reservation": "a miss found no MSHR, merge slot, line or queue entry and was tried again",
+    "l1_reservation": "a miss found no MSHR, merge slot, line or queue entry and was tried again, "
+    "without long queues below",
     "interconnect": "requests or replies queued in the interconnect",
     "l2": "requests queued at the L2 slices (and GL1, LLC)",
     "dram": "requests queued at the memory controllers or for the memory's bus",
@@ -68,6 +69,7 @@ class PassTiming:
     warp_instructions: kind -> issued warp instructions ("memory" among them).
     resident_warp_cycles: sum over SMs and cycles of resident warps; sm_cycles: SMs x cycles without
         the launch; max_warps: of one SM. levels: "l1", ("gl1",) "l2", ("llc",) "dram".
+    rows_opened: activate commands of memory.
     """
 
     name: str
@@ -80,6 +82,7 @@ class PassTiming:
     sm_cycles: int
     max_warps: int
     levels: Mapping[str, LevelTiming]
+    rows_opened: int = 0
 
     @property
     def occupancy(self) -> float | None:
@@ -119,6 +122,7 @@ class PassTiming:
             self.sm_cycles + other.sm_cycles,
             max(self.max_warps, other.max_warps),
             merged(self.levels, other.levels),
+            self.rows_opened + other.rows_opened,
         )
 
     def to_json(self) -> dict[str, Any]:
@@ -132,6 +136,7 @@ class PassTiming:
             "warp_instructions": dict(self.warp_instructions),
             "occupancy": self.occupancy,
             "bottleneck": self.bottleneck,
+            "rows_opened": self.rows_opened,
             "levels": {
                 name: {
                     "bytes": level.bytes,
