@@ -47,6 +47,20 @@ def lowest(mask):  # type: ignore[no-untyped-def]
     return _trailing_zeros(mask)  # type: ignore[call-arg]
 
 
+@intrinsic
+def _leading_zeros(typingctx: Any, mask: Any) -> Any:
+    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        return builder.ctlz(arguments[0], ir.Constant(ir.IntType(1), 1))
+
+    return types.int64(types.uint64), codegen
+
+
+@small
+def highest(mask):  # type: ignore[no-untyped-def]
+    """Place of the highest bit that is set; `mask` is not 0."""
+    return 63 - _leading_zeros(mask)  # type: ignore[call-arg, operator]
+
+
 @small
 def bit_at(place):  # type: ignore[no-untyped-def]
     """The mask with one bit."""

@@ -15,7 +15,7 @@ import numpy as np
 
 from cachesim.compiled import compiled, small
 from cachesim.stream import STORE
-from cachesim.timing.bits import bit_at, lowest, without_lowest
+from cachesim.timing.bits import bit_at, lowest, num_set, without_lowest
 from cachesim.timing.records import (
     CONTROL,
     FP32,
@@ -179,7 +179,7 @@ def collect(state, index):  # type: ignore[no-untyped-def]
             _read_operands(sm, machine.num_schedulers, written)
             changed = True
         # Each of the ports takes the oldest of every unit in turn.
-        moved = True
+        moved = sm.num_collecting > num_set(sm.collecting)
         while moved:
             moved = _allocate(sm, FP32, units_mask)
             moved |= _allocate(sm, SFU, units_mask)

@@ -15,6 +15,7 @@ from cachesim.timing.access import (
     drop_request,
     take_request,
 )
+from cachesim.timing.bits import highest
 from cachesim.timing.network import has_room
 from cachesim.timing.partition import is_drawn, locate
 from cachesim.timing.records import (
@@ -66,14 +67,6 @@ def _new_request(state, unit, address, at, sector):  # type: ignore[no-untyped-d
 
 
 @small
-def _highest(mask):  # type: ignore[no-untyped-def]
-    sector = 7
-    while (mask >> sector) & 1 == 0:
-        sector -= 1
-    return sector
-
-
-@small
 def _out_of_bandwidth(pipe):  # type: ignore[no-untyped-def]
     """Note why the instruction is not done, and that it is not."""
     if pipe.blocked == 0:
@@ -109,7 +102,7 @@ def issue_accesses(state, unit):  # type: ignore[no-untyped-def]
         if pipe.mask == 0:
             break
         at = pipe.at & machine.request_mask
-        sector = _highest(pipe.mask)
+        sector = highest(U64(pipe.mask))
         # The highest address bit is dropped: the engine's addresses are signed.
         address = (work.asks[at].line << level.line_shift) + (sector << level.sector_shift)
         address &= MAX_ADDRESS

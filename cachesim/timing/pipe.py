@@ -54,8 +54,11 @@ def _write_back(state, unit):  # type: ignore[no-untyped-def]
             _write_register(state, pipe.next_writeback)
         returned(state, pipe.next_writeback)
         pipe.next_writeback = -1
-    for c in range(5):
-        client = (c + pipe.client) % 5
+    has_l1 = state.l1.nodes[unit].ready_first >= 0
+    if not has_l1 and pipe.next_global < 0 and pipe.result_count == 0:
+        return False
+    client = pipe.client
+    for _ in range(5):
         if client == 1:
             if machine.has_fifo_l1 and pipe.result_count > 0:
                 pipe.next_writeback = fifo.next_result(state, unit)
@@ -63,10 +66,11 @@ def _write_back(state, unit):  # type: ignore[no-untyped-def]
             if pipe.next_global >= 0:
                 pipe.next_writeback = pipe.next_global
                 pipe.next_global = -1
-        elif client == 4 and state.l1.nodes[unit].ready_first >= 0:
+        elif client == 4 and has_l1:
             pipe.next_writeback = next_ready(state.l1, state.pool.requests, unit)
+        client = client + 1 if client < 4 else 0
         if pipe.next_writeback >= 0:
-            pipe.client = (client + 1) % 5
+            pipe.client = client
             return True
     return False
 

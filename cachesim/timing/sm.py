@@ -269,15 +269,20 @@ def step_sm(state, index):  # type: ignore[no-untyped-def]
     if issued > 0:
         machine.progress = now
     for s in range(machine.num_schedulers):
-        sm.stall[s] = _find_stall(sm, state.scheduler_masks[s], blocked)
         if (issuers >> s) & 1:
             state.reasons[R_ISSUE] += 1
         else:
+            sm.stall[s] = _find_stall(sm, state.scheduler_masks[s], blocked)
             state.reasons[sm.stall[s]] += 1
     sm.wake = _next_event(state, index)
     sm.waits_for_room = 0
     if sm.wake == now + 1 and issued == 0 and not has_moved:
         _sleep(state, index)
+    if sm.wake > now + 1:
+        # What those that issued wait for while the SM sleeps.
+        for s in range(machine.num_schedulers):
+            if (issuers >> s) & 1:
+                sm.stall[s] = _find_stall(sm, state.scheduler_masks[s], blocked)
 
 
 @compiled
