@@ -58,7 +58,7 @@ def _leading_zeros(typingctx: Any, mask: Any) -> Any:
 @small
 def highest(mask):  # type: ignore[no-untyped-def]
     """Place of the highest bit that is set; `mask` is not 0."""
-    return 63 - _leading_zeros(mask)  # type: ignore[call-arg, operator]
+    return 63 - _leading_zeros(mask)  # type: ignore[call-arg]
 
 
 @small
