@@ -385,6 +385,15 @@ def count_bypass(tags, group, is_write):  # type: ignore[no-untyped-def]
         tags.counters[group, BYPASSED_WRITES] += 1
 
 
+@small
+def note_filled(tags, node, sector):  # type: ignore[no-untyped-def]
+    """A sector can be read, or be written, that could not before."""
+    home = tags.nodes[node]
+    home.version += 1
+    home.num_filled += 1
+    home.filled_sector = sector
+
+
 @compiled
 def fill(tags, pool, node, request, now):  # type: ignore[no-untyped-def]
     """The data of a read that this instance sent down has come back."""
@@ -409,5 +418,4 @@ def fill(tags, pool, node, request, now):  # type: ignore[no-untyped-def]
         one.valid |= bit
         one.partial &= ~bit
     mark_ready(tags, node, address >> level.sector_shift)
-    tags.nodes[node].version += 1
-    tags.nodes[node].num_filled += 1
+    note_filled(tags, node, address >> level.sector_shift)

@@ -8,6 +8,7 @@ from cachesim.timing.access import (
     MISSES,
     access,
     drop_request,
+    note_filled,
     since,
 )
 from cachesim.timing.records import (
@@ -51,17 +52,37 @@ def drain_misses(state, unit):  # type: ignore[no-untyped-def]
 
 
 @small
+def _is_new(bank, seen, count, last, shift):  # type: ignore[no-untyped-def]
+    """Whether of `count` sectors those after the first `seen` may be what a bank's failed look-up
+    waits for: the same above `shift` bits. Only the last one is known.
+    """
+    if seen == count:
+        return False
+    return count - seen > 1 or (bank.sector ^ last) >> shift == 0
+
+
+@small
 def _may_succeed(state, node, bank):  # type: ignore[no-untyped-def]
     """Whether something has changed that a failed look-up waits for."""
     if bank.failed == node.version:
         return False
-    reason = bank.reason
-    if reason == NO_OTHER or bank.filled != node.num_filled:
-        return True
     level = state.l1.level[0]
-    if reason == NO_QUEUE:
-        return node.miss_count + 1 < level.miss_queue
-    return node.mshr_used < level.num_mshrs or bank.taken != node.num_taken
+    in_line = level.line_shift - level.sector_shift
+    if bank.reason == NO_OTHER or _is_new(
+        bank, bank.filled, node.num_filled, node.filled_sector, in_line
+    ):
+        return True
+    if bank.reason == NO_QUEUE:
+        if node.miss_count + 1 < level.miss_queue:
+            return True
+    elif node.mshr_used < level.num_mshrs or _is_new(
+        bank, bank.taken, node.num_taken, node.taken_sector, 0
+    ):
+        return True
+    bank.failed = node.version
+    bank.filled = node.num_filled
+    bank.taken = node.num_taken
+    return False
 
 
 @small
@@ -103,6 +124,7 @@ def look_up(state, unit):  # type: ignore[no-untyped-def]
             bank.reason = node.fail_reason
             bank.filled = node.num_filled
             bank.taken = node.num_taken
+            bank.sector = one.address >> state.l1.level[0].sector_shift
             bank.write = one.write
             _note_fail(pipe, bank)
             continue
@@ -118,8 +140,7 @@ def look_up(state, unit):  # type: ignore[no-untyped-def]
             prefetch(state.pool.requests, following.request)  # type: ignore[call-arg]
             prefetch(state.l1.buckets, following.entered)
         if one.operation == STORE:
-            node.version += 1
-            node.num_filled += 1
+            note_filled(state.l1, unit, one.address >> state.l1.level[0].sector_shift)
             if not sent:
                 store_done(state, one.warp)
                 drop_request(state.pool, request)

@@ -171,6 +171,8 @@ NODE = _in_lines(
     ("out_head", "i2"),
     ("failed_write", "i2"),  # whether what failed is a store
     ("fail_reason", "i2"),  # of the last look-up that failed
+    ("filled_sector", "i8"),  # numbers of the sectors filled and taken last
+    ("taken_sector", "i8"),
 )
 
 #: The rules and sizes of one level.
@@ -304,6 +306,7 @@ L1_BANK = _in_lines(
     ("taken", "i8"),
     ("write", "i4"),  # whether what failed is a store
     ("reason", "i4"),  # why it failed
+    ("sector", "i8"),  # which sector was looked up
 )
 
 WARP = _in_lines(

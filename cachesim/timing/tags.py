@@ -179,6 +179,7 @@ def take_mshr(tags, requests, node, key, request):  # type: ignore[no-untyped-de
     home.mshr_free = entry.ready_next
     home.mshr_used += 1
     home.num_taken += 1
+    home.taken_sector = key
     bucket = node * (mask + 1) + (spread(key) & mask)
     entry.key = key
     entry.chain = tags.mshr_buckets[bucket]
