@@ -6,10 +6,9 @@ import functools
 
 import numpy as np
 import pytest
-from timing_machines import sectors
+from timing_machines import sectors, timed
 
 from cachesim import presets
-from cachesim.timing.clock import Clock
 from cachesim.timing.results import PassTiming, TimingResult
 from experiments.timing_tables import notes
 
@@ -26,15 +25,11 @@ CASES = {
 
 
 @functools.cache
-def timed(footprint_bytes: int, *overrides: str) -> PassTiming:
+def reads(footprint_bytes: int, *overrides: str) -> PassTiming:
     """Every warp reads eight times four random sectors at once."""
     numbers = np.random.default_rng(1).integers(0, footprint_bytes // 32, size=(14 * 32, 8, 4))
     trace = sectors(numbers * 32, warps_per_cta=8, loads_in_flight=8)
-    clock = Clock(trace, presets.load(GPU, overrides), "readonly")
-    for chunk in trace.chunks():
-        clock.add(chunk)
-    clock.finish()
-    return clock.timing_result().total
+    return timed(trace, presets.load(GPU, overrides), "readonly").timing_result().total
 
 
 def running(part: PassTiming) -> int:
@@ -44,23 +39,23 @@ def running(part: PassTiming) -> int:
 @pytest.mark.parametrize("named", CASES)
 def test_what_is_named_is_what_binds(named: str) -> None:
     footprint, scarce, twice = CASES[named]
-    before = timed(footprint, scarce)
+    before = reads(footprint, scarce)
     assert before.bottleneck == named
-    assert running(timed(footprint, twice)) < 0.62 * running(before)
+    assert running(reads(footprint, twice)) < 0.62 * running(before)
 
 
 @pytest.mark.parametrize("named", ["dram", "interconnect"])
 def test_full_mshrs_are_not_the_bottleneck_where_requests_queue_behind_them(named: str) -> None:
     """Twice as many fill up, too: accesses are refused as before, and nothing is faster."""
     footprint, scarce, _ = CASES[named]
-    before = timed(footprint, scarce)
-    more = timed(footprint, scarce, "l1_timing.num_mshrs=256")
+    before = reads(footprint, scarce)
+    more = reads(footprint, scarce, "l1_timing.num_mshrs=256")
     assert abs(running(more) / running(before) - 1) < 0.02
     assert more.bottleneck == before.bottleneck == named
 
 
 def test_memory_that_opens_a_row_for_each_sector_says_so() -> None:
-    part = timed(*CASES["dram"][:2])
+    part = reads(*CASES["dram"][:2])
     opened = part.levels["dram"].bytes / part.rows_opened
     assert 32 <= opened < 36 and (part.utilisation("dram") or 1) < 0.25
     told = " ".join(notes(TimingResult(1_480_000_000, (part,)), presets.load(GPU)))

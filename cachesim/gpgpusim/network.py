@@ -18,7 +18,7 @@ _MODES = {
     "1": "BookSim: an input sends one packet in a cycle at most",
     "2": "the built-in crossbar: an input may send to one output after the other in a cycle",
 }
-#: BookSim's own values where a file has none; 0 takes the value of _FALLBACK.
+#: BookSim's own values where a file has none; 0 takes them, too.
 _BOOKSIM_DEFAULTS = {
     "flit_size": 32,
     "num_vcs": 16,
@@ -162,9 +162,9 @@ def _network_number(file: dict[str, Setting] | None, key: str) -> int:
     setting = (file or {}).get(key)
     if setting is None:
         return _BOOKSIM_DEFAULTS[key]
-    least = 1 if key in ("flit_size", "num_vcs", "vc_buf_size", "internal_speedup") else 0
     if key == "internal_speedup":
         return _speedup(setting)
+    least = 1 if key in ("flit_size", "num_vcs", "vc_buf_size") else 0
     if not (setting.text.isdecimal() and len(setting.text) < 7 and int(setting.text) >= least):
         raise setting.refuse(f"allowed are whole numbers from {least}")
     # BookSim takes 0 as "my default".

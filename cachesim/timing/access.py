@@ -400,10 +400,9 @@ def fill(tags, pool, node, request, now):  # type: ignore[no-untyped-def]
     level = tags.level[0]
     one_request = pool.requests[request]
     address = one_request.address
-    key = address >> level.line_shift
-    sector = (address >> level.sector_shift) & level.sector_mask
-    bit = 1 << sector
-    line = find_line(tags, node, key)
+    number = address >> level.sector_shift
+    bit = 1 << (number & level.sector_mask)
+    line = find_line(tags, node, address >> level.line_shift)
     if line >= 0 and tags.lines[line].reserved & bit:
         one = tags.lines[line]
         one.reserved &= ~bit
@@ -417,5 +416,5 @@ def fill(tags, pool, node, request, now):  # type: ignore[no-untyped-def]
         one = tags.lines[line]
         one.valid |= bit
         one.partial &= ~bit
-    mark_ready(tags, node, address >> level.sector_shift)
-    note_filled(tags, node, address >> level.sector_shift)
+    mark_ready(tags, node, number)
+    note_filled(tags, node, number)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -19,46 +20,41 @@ def power_of_two(number: int) -> int:
     return 1 << max(0, number - 1).bit_length()
 
 
-@intrinsic
-def _trailing_zeros(typingctx: Any, mask: Any) -> Any:
-    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        return builder.cttz(arguments[0], ir.Constant(ir.IntType(1), 1))
+def _counting(build: Callable[[Any, Any], Any]) -> Any:
+    """A compiled function of a mask whose result one of the host's instructions counts."""
 
-    return types.int64(types.uint64), codegen
+    @intrinsic
+    def count(typingctx: Any, mask: Any) -> Any:
+        def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+            return build(builder, arguments[0])
+
+        return types.int64(types.uint64), codegen
+
+    return count
 
 
-@intrinsic
-def _population(typingctx: Any, mask: Any) -> Any:
-    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        return builder.ctpop(arguments[0])
-
-    return types.int64(types.uint64), codegen
+_NOT_ZERO = ir.Constant(ir.IntType(1), 1)
+_trailing_zeros = _counting(lambda builder, mask: builder.cttz(mask, _NOT_ZERO))
+_leading_zeros = _counting(lambda builder, mask: builder.ctlz(mask, _NOT_ZERO))
+_population = _counting(lambda builder, mask: builder.ctpop(mask))
 
 
 @small
 def num_set(mask):  # type: ignore[no-untyped-def]
     """How many bits are set."""
-    return _population(mask)  # type: ignore[call-arg]
+    return _population(mask)
 
 
 @small
 def lowest(mask):  # type: ignore[no-untyped-def]
     """Place of the lowest bit that is set; `mask` is not 0."""
-    return _trailing_zeros(mask)  # type: ignore[call-arg]
-
-
-@intrinsic
-def _leading_zeros(typingctx: Any, mask: Any) -> Any:
-    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        return builder.ctlz(arguments[0], ir.Constant(ir.IntType(1), 1))
-
-    return types.int64(types.uint64), codegen
+    return _trailing_zeros(mask)
 
 
 @small
 def highest(mask):  # type: ignore[no-untyped-def]
     """Place of the highest bit that is set; `mask` is not 0."""
-    return 63 - _leading_zeros(mask)  # type: ignore[call-arg]
+    return 63 - _leading_zeros(mask)
 
 
 @small

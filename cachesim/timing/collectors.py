@@ -134,13 +134,11 @@ def _allocate(sm, unit, units_mask):  # type: ignore[no-untyped-def]
     one.again = source.again
     bit = bit_at(place)
     sm.collecting |= bit
-    sm.accesses &= ~bit
     if source.banks != 0:
         sm.reading |= bit
     if unit == MEMORY:
         one.row = source.row
         one.load = source.load
-        sm.accesses |= bit
     sm.turn[unit] = turn >> 4
     sm.waiting[unit] &= ~(1 << s)
     sm.is_stuck = 0
@@ -163,7 +161,7 @@ def collect(state, index):  # type: ignore[no-untyped-def]
         while left != 0:
             place = lowest(left)
             left = without_lowest(left)
-            if sm.accesses & bit_at(place):
+            if sm.collector[place].kind == MEMORY:
                 if sm.queue_count[place // MAX_COLLECTORS] > 0:
                     continue
                 _to_load_store(sm, place)
@@ -190,15 +188,13 @@ def collect(state, index):  # type: ignore[no-untyped-def]
 
 
 @small
-def _note_banks(one, machine, operation, chain):  # type: ignore[no-untyped-def]
-    """The banks of an arithmetic instruction's operands."""
-    total = machine.register_banks
-    one.banks = 1 << ((SUM + chain) % total)
-    one.again = 0
-    if operation.load >= 0:
-        loaded = 1 << ((LOADED + operation.load) % total)
-        one.again = one.banks & loaded
-        one.banks |= loaded
+def _note_banks(one, num_banks, first, second):  # type: ignore[no-untyped-def]
+    """The banks of an instruction's one or two operands; second: -1 where there is none."""
+    one.banks = 1 << (first % num_banks)
+    if second >= 0:
+        other = 1 << (second % num_banks)
+        one.again = one.banks & other
+        one.banks |= other
 
 
 @compiled
@@ -206,7 +202,7 @@ def enter_collectors(state, index, s, slot, warp, kind):  # type: ignore[no-unty
     """Issue to the collectors' entry."""
     machine = state.pool.machine[0]
     sm = state.sms[index]
-    unit = kind if kind == MEMORY else unit_of(machine, kind)
+    unit = unit_of(machine, kind)
     sm.order += 1
     sm.num_collecting += 1
     sm.collect_from = 0
@@ -227,17 +223,16 @@ def enter_collectors(state, index, s, slot, warp, kind):  # type: ignore[no-unty
         one.row = warp.row
         one.load = note_access(state, warp, row)
         if machine.register_banks > 0:
-            one.banks = 1 << (ADDRESS % machine.register_banks)
-            if state.work.instructions[row.code].operation == STORE:
-                data = 1 << (SUM % machine.register_banks)
-                one.again = one.banks & data
-                one.banks |= data
+            stores = state.work.instructions[row.code].operation == STORE
+            _note_banks(one, machine.register_banks, ADDRESS, SUM if stores else -1)
     elif is_exit(warp):
         one.chain = -1
         warp.exit_ready = NEVER
     else:
         if machine.register_banks > 0 and kind != CONTROL:
-            _note_banks(one, machine, state.work.operations[warp.operation], warp.chain)
+            load = state.work.operations[warp.operation].load
+            loaded = LOADED + load if load >= 0 else -1
+            _note_banks(one, machine.register_banks, SUM + warp.chain, loaded)
         warp.chains_ready[warp.chain] = NEVER
         if kind == INT:
             warp.int_ready = NEVER

@@ -62,6 +62,14 @@ def _is_new(bank, seen, count, last, shift):  # type: ignore[no-untyped-def]
 
 
 @small
+def _note_tried(node, bank):  # type: ignore[no-untyped-def]
+    """A bank's look-up fails as the unit stands now."""
+    bank.failed = node.version
+    bank.filled = node.num_filled
+    bank.taken = node.num_taken
+
+
+@small
 def _may_succeed(state, node, bank):  # type: ignore[no-untyped-def]
     """Whether something has changed that a failed look-up waits for."""
     if bank.failed == node.version:
@@ -79,9 +87,7 @@ def _may_succeed(state, node, bank):  # type: ignore[no-untyped-def]
         bank, bank.taken, node.num_taken, node.taken_sector, 0
     ):
         return True
-    bank.failed = node.version
-    bank.filled = node.num_filled
-    bank.taken = node.num_taken
+    _note_tried(node, bank)
     return False
 
 
@@ -120,10 +126,8 @@ def look_up(state, unit):  # type: ignore[no-untyped-def]
         one = state.pool.requests[request]
         outcome, sent = access(state.l1, state.pool, unit, request, now)
         if outcome == FAIL:
-            bank.failed = node.version
+            _note_tried(node, bank)
             bank.reason = node.fail_reason
-            bank.filled = node.num_filled
-            bank.taken = node.num_taken
             bank.sector = one.address >> state.l1.level[0].sector_shift
             bank.write = one.write
             _note_fail(pipe, bank)

@@ -112,9 +112,9 @@ def _where(before: Snapshot, after: Snapshot, gpu: Gpu, launch: int) -> dict[str
     latency = int((after.latency - before.latency)[:, 0].sum())
     slots = {name: int(spent[code]) for name, code in _DIRECT.items()}
     waiting = [(int(spent[R_MEMORY]), "latency", max(0, latency - sum(queues.values())))]
-    for name in ("l1_reservation", "interconnect"):
-        if sum(queues.values()) > 0:
-            waiting.append((slots.pop(name), name, unloaded))
+    if any(queues.values()):
+        full = ("l1_reservation", "interconnect")
+        waiting += [(slots.pop(name), name, unloaded) for name in full]
     for total, own, rest in waiting:
         weights = dict(queues)
         weights[own] = weights.get(own, 0) + rest

@@ -230,10 +230,9 @@ SM = _in_lines(
     ("queue_count", "i1", (MAX_SCHEDULERS,)),
     ("queue_head", "i1", (MAX_SCHEDULERS,)),
     # GPGPU-Sim's operand collectors, MAX_COLLECTORS places for each scheduler. Masks of places:
-    # those in use, and of them those that wait for operands and those that hold an access.
+    # those in use, and of them those that wait for operands.
     ("collecting", "u8"),
     ("reading", "u8"),
-    ("accesses", "u8"),
     ("order", "i8"),  # of issue, and of entry into a collector
     ("resident_since", "i8"),
     # By unit: the schedulers whose issued instruction waits for a collector, as a mask and in

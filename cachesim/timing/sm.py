@@ -90,8 +90,7 @@ def _has_room(state, index, scheduler, kind, now):  # type: ignore[no-untyped-de
     machine = state.pool.machine[0]
     sm = state.sms[index]
     if machine.collector_units > 0:
-        unit = kind if kind == MEMORY else unit_of(machine, kind)
-        return (sm.waiting[unit] >> scheduler) & 1 == 0
+        return (sm.waiting[unit_of(machine, kind)] >> scheduler) & 1 == 0
     if kind == MEMORY:
         return sm.queue_count[scheduler] < machine.memory_queue
     return sm.unit_free[unit_of(machine, kind), scheduler] <= now + AHEAD
